@@ -1,0 +1,1 @@
+"""The HTTP API: uploads, drives, jobs, labels, models, metrics."""

@@ -1,0 +1,1 @@
+"""The l3ps command: label, evaluate, simulate, bench, up, submit, download."""

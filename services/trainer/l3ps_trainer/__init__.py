@@ -1,0 +1,1 @@
+"""The trainer: few annotated images to an ONNX model bundle."""

@@ -1,0 +1,1 @@
+"""Celery workers: load, call l3ps, store, record."""

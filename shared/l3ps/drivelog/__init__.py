@@ -1,0 +1,1 @@
+"""Drive logs: types, one reader a format, safe unpacking, pre-flight validation."""

@@ -1,0 +1,1 @@
+"""Panoptic quality and IoU under the three protocols."""

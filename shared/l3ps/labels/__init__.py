@@ -1,0 +1,1 @@
+"""Label files: one writer and reader a format."""

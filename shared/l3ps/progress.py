@@ -1,0 +1,16 @@
+"""Progress and cancellation as the method sees them: one callable, no queue, no terminal."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called by long work after each unit; may raise :class:`l3ps.errors.Cancelled` to stop it."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that ``done`` of ``total`` units of ``stage`` are finished."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """The progress of a caller who does not want any."""

@@ -1,0 +1,1 @@
+"""3D refinement of primal labels: accumulate, ground, cluster, vote, instances."""

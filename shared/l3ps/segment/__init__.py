@@ -1,0 +1,1 @@
+"""2D panoptic segmentation: model bundle, ONNX session, fusion of the heads."""

@@ -1,0 +1,1 @@
+"""Synthetic drives with cameras and full truth."""

@@ -1,0 +1,1 @@
+"""Settings, catalog, object store, queue and telemetry shared by the services."""
