@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Any
 
-import redis.exceptions
 import sqlalchemy.exc
+import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from kombu.exceptions import OperationalError as QueueError
 from l3ps.errors import InputError
+from l3ps_platform.errors import (
+    CatalogUnavailable,
+    Conflict,
+    InvalidKey,
+    InvalidSignature,
+    NotFound,
+    ObjectMissing,
+    QueueUnavailable,
+    StoreUnavailable,
+    UploadError,
+)
 from starlette.exceptions import HTTPException
 
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, items, unavailable
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
 
-log = logging.getLogger(__name__)
+log = structlog.get_logger(__name__)
 Handler = Callable[[Request, Any], Awaitable[JSONResponse]]
 
 
@@ -83,18 +92,41 @@ def _bad_input(_: Request, error: InputError) -> ApiProblem:
     return ApiProblem(422, "bad-input", "The input cannot be used", str(error), items(error.problems))
 
 
-def _catalog_down(_: Request, error: Exception) -> ApiProblem:
-    log.warning("catalog unavailable: %s", error)
-    return unavailable("catalog")
+def _not_found(_: Request, error: NotFound) -> ApiProblem:
+    return unknown(error.kind, error.id)
 
 
-def _queue_down(_: Request, error: Exception) -> ApiProblem:
-    log.warning("queue unavailable: %s", error)
-    return unavailable("queue")
+def _conflict(_: Request, error: Conflict) -> ApiProblem:
+    return conflict("conflict", "Not possible in the present state", _sentence(error))
+
+
+def _forbidden(_: Request, error: InvalidSignature | InvalidKey) -> ApiProblem:
+    return ApiProblem(403, "invalid-signature", "The URL does not permit this", _sentence(error))
+
+
+def _no_object(_: Request, error: ObjectMissing) -> ApiProblem:
+    return ApiProblem(404, "unknown-object", "Unknown object", f"{_sentence(error)} Ask the API for a new URL.")
+
+
+def _upload_error(_: Request, error: UploadError) -> ApiProblem:
+    return ApiProblem(409, "upload-closed", "The upload is closed", _sentence(error))
+
+
+def _down(what: str) -> Callable[[Request, Exception], ApiProblem]:
+    def translate(_: Request, error: Exception) -> ApiProblem:
+        log.warning(f"{what} unavailable", reason=str(error))
+        return unavailable(what)
+
+    return translate
+
+
+def _sentence(error: Exception) -> str:
+    text = str(error)
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def _unexpected(request: Request, error: Exception) -> ApiProblem:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    log.error("request failed", method=request.method, path=request.url.path, exc_info=error)
     detail = "The service failed at this request; the fault is in the service. Its log says more."
     return ApiProblem(500, "internal", "Internal error", detail)
 
@@ -104,10 +136,15 @@ _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]
     (RequestValidationError, _invalid_request),
     (HTTPException, _http_error),
     (InputError, _bad_input),
-    (sqlalchemy.exc.OperationalError, _catalog_down),
-    (sqlalchemy.exc.TimeoutError, _catalog_down),
-    (redis.exceptions.ConnectionError, _queue_down),
-    (redis.exceptions.TimeoutError, _queue_down),
-    (QueueError, _queue_down),
+    (NotFound, _not_found),
+    (Conflict, _conflict),
+    (InvalidSignature, _forbidden),
+    (InvalidKey, _forbidden),
+    (ObjectMissing, _no_object),
+    (UploadError, _upload_error),
+    (StoreUnavailable, _down("object store")),
+    (QueueUnavailable, _down("queue")),
+    (CatalogUnavailable, _down("catalog")),
+    (sqlalchemy.exc.TimeoutError, _down("catalog")),  # no free connection
     (Exception, _unexpected),
 )

@@ -7,23 +7,20 @@ service recognises what it has seen before.
 from __future__ import annotations
 
 import hashlib
-import io
-import json
 import os
 import tarfile
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
-from l3ps.errors import DriveLogError, ModelError, Problem
+from l3ps.errors import DriveLogError, Problem
+from l3ps.segment.bundle import ModelBundle
 
 Report = Callable[[int, int], None]
 """Called with (bytes done, bytes in all)."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.zst")
 _CHUNK = 1 << 20
-_BUNDLE_FILES = ("model.json", "about.json")
 
 
 def pack_log(log: Path, archive: Path, report: Report = lambda done, total: None) -> None:
@@ -50,10 +47,11 @@ def pack_log(log: Path, archive: Path, report: Report = lambda done, total: None
 
 
 def pack_bundle(bundle: Path, archive: Path) -> None:
-    """Write a model bundle's directory as a zip holding ``model.onnx`` and ``model.json``."""
-    network, description = bundle / "model.onnx", _description_file(bundle)
+    """Write a model bundle's directory, one that ``bundle_name`` accepts, as a zip."""
+    names = ("model.json", "about.json")
+    description = next(path for name in names if (path := bundle / name).is_file())
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as target:
-        for name, source in (("model.json", description), ("model.onnx", network)):
+        for name, source in (("model.json", description), ("model.onnx", bundle / "model.onnx")):
             with source.open("rb") as content, target.open(zipfile.ZipInfo(name), "w", force_zip64=True) as member:
                 while block := content.read(_CHUNK):
                     member.write(block)
@@ -61,17 +59,7 @@ def pack_bundle(bundle: Path, archive: Path) -> None:
 
 def bundle_name(bundle: Path) -> str:
     """The name a model bundle (directory or zip) gives itself; ModelError when it is no bundle."""
-    if bundle.is_dir():
-        if not (bundle / "model.onnx").is_file():
-            raise _not_a_bundle(bundle, "model.onnx is missing")
-        text = _description_file(bundle).read_text(encoding="utf-8")
-    else:
-        text = _description_in_zip(bundle)
-    try:
-        description: Any = json.loads(text)
-        return str(description["name"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise _not_a_bundle(bundle, f"its description has no readable name ({error})") from None
+    return ModelBundle.load(bundle).info.name
 
 
 def sha256_of(path: Path, report: Report = lambda done, total: None) -> str:
@@ -103,32 +91,3 @@ def _files(root: Path) -> Iterator[Path]:
 def _is_entered(folder: Path, entered: set[tuple[int, int]]) -> bool:
     status = folder.stat()
     return (status.st_dev, status.st_ino) in entered
-
-
-def _description_file(bundle: Path) -> Path:
-    for name in _BUNDLE_FILES:
-        if (bundle / name).is_file():
-            return bundle / name
-    raise _not_a_bundle(bundle, "model.json is missing")
-
-
-def _description_in_zip(bundle: Path) -> str:
-    try:
-        with zipfile.ZipFile(bundle) as archive:
-            for name in _BUNDLE_FILES:
-                if name in archive.namelist():
-                    return io.TextIOWrapper(archive.open(name), encoding="utf-8").read()
-    except (zipfile.BadZipFile, UnicodeDecodeError) as error:
-        raise _not_a_bundle(bundle, f"it cannot be read as a zip ({error})") from None
-    raise _not_a_bundle(bundle, "model.json is missing")
-
-
-def _not_a_bundle(bundle: Path, what: str) -> ModelError:
-    return ModelError(
-        Problem(
-            "not-a-bundle",
-            str(bundle),
-            what,
-            "A model bundle is a directory or zip with model.onnx and model.json; or name a model the service knows.",
-        )
-    )

@@ -26,9 +26,9 @@ def archive_kind(head: bytes) -> str | None:
     return None
 
 
-def describe(head: bytes) -> str:
-    """A file that is no archive, in a few words for a message."""
+def describe(head: bytes, kind: str) -> str:
+    """A file that is not what it should be, in a few words for a message."""
+    wanted = "a zip" if kind == "model" else "a zip, gzip, zstd or tar"
     if not head:
-        return "the file is empty"
-    shown = head[:8].hex(" ")
-    return f"the file begins with {shown}, which is no zip, gzip, zstd or tar"
+        return "the file is empty (0 bytes)"
+    return f"the file begins with the bytes {head[:8].hex(' ')} and is not {wanted}"
