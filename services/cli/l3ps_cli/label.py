@@ -13,6 +13,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
+
 from l3ps.costs import StageCost
 from l3ps.drivelog import opened, validate, without_bad_scans
 from l3ps.drivelog.types import Drive, Scene
@@ -23,8 +25,6 @@ from l3ps.pipeline import primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
-from numpy.typing import NDArray
-
 from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table
@@ -66,8 +66,8 @@ def label(
         _choose(dict.fromkeys(FORMATS), label_format, "--format")
         started = time.perf_counter()
         segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
-        with opened(log) as drive, _all_or_nothing(output) as staging:
-            drive = _checked(_limited(drive, scene), skip_bad_scans)
+        with opened(log) as whole, _all_or_nothing(output) as staging:
+            drive = _checked(_limited(whole, scene), skip_bad_scans)
             run = Run()
             for one in drive.scenes:
                 _label_scene(drive, one, segmenter, parameters, label_format, staging, run, protocol, threads)
