@@ -12,6 +12,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
+from rich.table import Table
+
 from l3ps.drivelog import opened
 from l3ps.drivelog.types import Points, Scene
 from l3ps.labels import ScanLabels
@@ -21,9 +24,6 @@ from l3ps.refine.accumulate import transform
 from l3ps.refine.cluster import hdbscan_package
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.taxonomy import NUSCENES16
-from numpy.typing import NDArray
-from rich.table import Table
-
 from l3ps_cli.errors import clear_errors, out
 from l3ps_cli.progress import bars
 

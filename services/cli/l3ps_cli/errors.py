@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 import typer
-from l3ps.errors import Cancelled, InputError, L3psError
 from rich.console import Console
+
+from l3ps.errors import Cancelled, InputError, L3psError
 
 out = Console()
 err = Console(stderr=True)

@@ -13,6 +13,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
+
 from l3ps.costs import StageCost
 from l3ps.drivelog import opened, validate, without_bad_scans
 from l3ps.drivelog.types import Drive, Scene
@@ -23,8 +25,6 @@ from l3ps.pipeline import primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
-from numpy.typing import NDArray
-
 from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table
