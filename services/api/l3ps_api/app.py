@@ -10,14 +10,7 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from l3ps_platform.catalog import Catalog
-from l3ps_platform.catalog.migrate import upgrade
-from l3ps_platform.errors import StoreUnavailable
 from l3ps_platform.metrics import CatalogCollector
-from l3ps_platform.objects import open_store
-from l3ps_platform.queue import Queue
-from l3ps_platform.settings import Settings
-from l3ps_platform.workflow import Reconciler
 from prometheus_client import CollectorRegistry
 
 from l3ps_api import errors, problems
@@ -31,6 +24,13 @@ from l3ps_api.objects.routes import router as objects
 from l3ps_api.services import Services
 from l3ps_api.system.routes import health_router, metrics_router
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_platform.catalog import Catalog
+from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.errors import StoreUnavailable
+from l3ps_platform.objects import open_store
+from l3ps_platform.queue import Queue
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import Reconciler
 
 log = structlog.get_logger(__name__)
 

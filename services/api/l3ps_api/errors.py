@@ -11,7 +11,10 @@ import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
 from l3ps.errors import InputError
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
 from l3ps_platform.errors import (
     CatalogUnavailable,
     Conflict,
@@ -23,9 +26,6 @@ from l3ps_platform.errors import (
     StoreUnavailable,
     UploadError,
 )
-from starlette.exceptions import HTTPException
-
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
 
 log = structlog.get_logger(__name__)
 Handler = Callable[[Request, Any], Awaitable[JSONResponse]]

@@ -7,8 +7,9 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
-from l3ps.errors import Problem
 from pydantic import BaseModel, Field
+
+from l3ps.errors import Problem
 
 MEDIA_TYPE = "application/problem+json"
 

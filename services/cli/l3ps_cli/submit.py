@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from l3ps.errors import DriveLogError, Problem
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
+from l3ps.errors import DriveLogError, Problem
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.packing import ARCHIVE_SUFFIXES, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
@@ -123,7 +123,9 @@ def upload_log(client: Client, log: Path) -> dict[str, Any]:
         raise DriveLogError(Problem("no-log", str(log), what, remedy))
     if not is_archive_name(log):
         what = "it is no archive by its name"
-        raise DriveLogError(Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."))
+        raise DriveLogError(
+            Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}.")
+        )
     name = log.name
     for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
         name = name.removesuffix(suffix)

@@ -20,7 +20,7 @@ from l3ps_cli.stack import Stack, StackError, StackOptions
 DEFAULT_DATA = Path("~/.local/share/l3ps")
 
 
-class StopRequested(BaseException):  # noqa: N818  (a request, and nothing that catches Exception may swallow it)
+class StopRequested(BaseException):
     """Ctrl-C or SIGTERM."""
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from l3ps.errors import InputError
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StageState, StepRow, bundles, drives, jobs, stages
-from l3ps_platform.workflow import cancel_job, submit_job
 from sqlalchemy.orm import Session
 
+from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StageState, StepRow, bundles, drives, jobs, stages
+from l3ps_platform.workflow import cancel_job, submit_job
 
 
 def create(services: Services, request: JobRequest) -> Job:
@@ -23,7 +23,9 @@ def create(services: Services, request: JobRequest) -> Job:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
         skippable = all(problem.severity == "scan" for problem in found)
-        remedy = "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
+        remedy = (
+            "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
+        )
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
     return get(services, job.id)
@@ -38,7 +40,9 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
         of_model = bundles.many(session, [row.model_id for row in shown])
         progress = stages.progress(session, [row.id for row in shown])
     summaries = [
-        JobSummary(**summary_fields(row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress[row.id])))
+        JobSummary(
+            **summary_fields(row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress[row.id]))
+        )
         for row in shown
     ]
     return JobPage(items=summaries, next=shown[-1].id if len(rows) > limit else None)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from l3ps_platform.catalog.migrate import is_current
-from l3ps_platform.errors import CatalogUnavailable, PlatformError
-
 from l3ps_api.problems import ApiProblem, ErrorItem
 from l3ps_api.services import Services
+from l3ps_platform.catalog.migrate import is_current
+from l3ps_platform.errors import CatalogUnavailable, PlatformError
 
 _REMEDIES = {
     "catalog": "Check the database and L3PS_DATABASE_URL; run `python -m l3ps_platform.catalog.migrate` once a release.",

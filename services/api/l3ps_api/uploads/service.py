@@ -5,12 +5,6 @@ from __future__ import annotations
 from datetime import timedelta
 
 from l3ps.segment.bundle import MAX_MODEL_BYTES
-from l3ps_platform.catalog import Transaction, UploadRow, UploadState, bundles, drives, uploads
-from l3ps_platform.errors import Conflict, NotFound, UploadError
-from l3ps_platform.ids import new_id
-from l3ps_platform.objects import Part, segment
-from l3ps_platform.workflow import accept_drive, accept_model
-
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
@@ -18,6 +12,11 @@ from l3ps_api.services import Services
 from l3ps_api.uploads.parts import part_count, part_size
 from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
+from l3ps_platform.catalog import Transaction, UploadRow, UploadState, bundles, drives, uploads
+from l3ps_platform.errors import Conflict, NotFound, UploadError
+from l3ps_platform.ids import new_id
+from l3ps_platform.objects import Part, segment
+from l3ps_platform.workflow import accept_drive, accept_model
 
 _PRESIGN_LIMIT = timedelta(days=7)
 """S3's limit for the life of a presigned URL."""
