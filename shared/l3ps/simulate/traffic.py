@@ -67,6 +67,7 @@ def _kerbside(plan: Planner, side: int) -> None:
     rng, sign, half = plan.rng, plan.sign(side), plan.street.half_width
     works = float(rng.uniform(-50, 40)) if plan.chance(0.6) else 1e6
     stop = float(rng.uniform(-50, 50)) if plan.chance(0.5) else 1e6
+    free = float(rng.uniform(0.1, 0.45))  # some streets are parked up, others give a view of the pavement
     x = X_MIN + 10
     while x < X_MAX - 20:
         if plan.near_crossing(x + 3, 9):
@@ -81,8 +82,8 @@ def _kerbside(plan: Planner, side: int) -> None:
             plan.thing("vehicle.bus.rigid", made, x + length / 2, at, heading, attribute="vehicle.stopped")
             _waiting(plan, side, x + length / 2)
             stop, x = 1e6, x + length + 2.5
-        elif plan.chance(0.13):
-            x += float(rng.uniform(3, 8))
+        elif plan.chance(free):
+            x += float(rng.uniform(4, 12))
         else:
             category, made = _parked_vehicle(plan)
             width, length, _ = made[1]
