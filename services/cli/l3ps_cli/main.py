@@ -1,0 +1,23 @@
+"""The ``l3ps`` command: one file a subcommand."""
+
+from __future__ import annotations
+
+import typer
+
+from l3ps_cli.demo import demo
+from l3ps_cli.download import download
+from l3ps_cli.jobs import jobs
+from l3ps_cli.submit import submit
+from l3ps_cli.up import up
+
+app = typer.Typer(
+    name="l3ps",
+    help="LiDAR label engine: drive logs in, panoptic-labelled point clouds out, on CPUs alone.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+for command in (up, submit, jobs, download, demo):
+    app.command()(command)
+
+if __name__ == "__main__":
+    app()
