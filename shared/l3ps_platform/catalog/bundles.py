@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -12,7 +14,9 @@ from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import new_id
 
 
-def add(tx: Transaction, *, name: str, filename: str, size: int, object_key: str) -> ModelRow:
+def add(
+    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+) -> ModelRow:
     """A new model in state ``uploaded``; Conflict when the name is taken by a model that was not rejected.
 
     A rejected model that no job ever used gives up its name. :func:`l3ps_platform.workflow.accept_model` also has
@@ -35,6 +39,7 @@ def add(tx: Transaction, *, name: str, filename: str, size: int, object_key: str
         id=new_id("mdl"),
         name=name,
         filename=filename,
+        sha256=sha256,
         size=size,
         state=ModelState.UPLOADED,
         object_key=object_key,
@@ -74,6 +79,11 @@ def page(session: Session, *, limit: int = 50, before: str | None = None) -> lis
     if before is not None:
         query = query.where(ModelRow.id < before)
     return list(session.scalars(query.order_by(ModelRow.id.desc()).limit(limit)))
+
+
+def many(session: Session, ids: Iterable[str]) -> dict[str, ModelRow]:
+    """Models by id; ids without a row are left out."""
+    return {row.id: row for row in session.scalars(select(ModelRow).where(ModelRow.id.in_(set(ids))))}
 
 
 def leftover_archives(session: Session, limit: int = 100) -> list[ModelRow]:

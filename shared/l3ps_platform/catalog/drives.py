@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
@@ -14,12 +16,15 @@ from l3ps_platform.ids import new_id
 ACTIVE = (JobState.QUEUED, JobState.RUNNING)
 
 
-def add(tx: Transaction, *, name: str, filename: str, size: int, object_key: str) -> DriveRow:
+def add(
+    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+) -> DriveRow:
     """A new drive in state ``uploaded``; :func:`l3ps_platform.workflow.accept_drive` also has it checked."""
     row = DriveRow(
         id=new_id("drv"),
         name=name,
         filename=filename,
+        sha256=sha256,
         size=size,
         state=DriveState.UPLOADED,
         object_key=object_key,
@@ -47,12 +52,19 @@ def lock(session: Session, id: str) -> DriveRow:
     return row
 
 
-def page(session: Session, *, limit: int = 50, before: str | None = None) -> list[DriveRow]:
+def page(session: Session, *, limit: int = 50, before: str | None = None, sha256: str | None = None) -> list[DriveRow]:
     """Drives that are not deleted, newest first, after the cursor ``before`` (the last id of the page before)."""
     query = select(DriveRow).where(DriveRow.deleted_at.is_(None))
     if before is not None:
         query = query.where(DriveRow.id < before)
+    if sha256 is not None:
+        query = query.where(DriveRow.sha256 == sha256)
     return list(session.scalars(query.order_by(DriveRow.id.desc()).limit(limit)))
+
+
+def many(session: Session, ids: Iterable[str]) -> dict[str, DriveRow]:
+    """Drives by id, deleted ones too; ids without a row are left out."""
+    return {row.id: row for row in session.scalars(select(DriveRow).where(DriveRow.id.in_(set(ids))))}
 
 
 def in_use(session: Session, id: str) -> list[str]:

@@ -100,6 +100,7 @@ class UploadRow(Base):
     kind: Mapped[str] = mapped_column(String(16))  # drive | model
     filename: Mapped[str]
     size: Mapped[int]
+    sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
     parts: Mapped[int]
     state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
     object_key: Mapped[str]
@@ -114,7 +115,8 @@ class DriveRow(Base):
 
     ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
     ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
-    counts over the scans a job will label. ``object_key`` is None once the archive is deleted.
+    counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
+    archive file's: the client's claim until the ingest stage has compared it.
     """
 
     __tablename__ = "drives"
@@ -194,7 +196,8 @@ class StageRow(Base):
     """One unit of work a worker can own.
 
     An ingest stage has a drive or a model, a publish stage a job, segment and refine stages a scene and its job.
-    ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …). ``not_before`` holds back a retry.
+    ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
+    count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
     """
 
     __tablename__ = "stages"
@@ -215,6 +218,7 @@ class StageRow(Base):
     progress_step: Mapped[str | None] = mapped_column(String(32))
     progress_done: Mapped[int] = mapped_column(default=0)
     progress_total: Mapped[int] = mapped_column(default=0)
+    fraction: Mapped[float] = mapped_column(default=0.0)
     seconds: Mapped[float | None]
     cpu_seconds: Mapped[float | None]
     peak_mb: Mapped[float | None]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from sqlalchemy import select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import StageRow, StepRow
-from l3ps_platform.catalog.states import StageName
+from l3ps_platform.catalog.states import StageName, StageState
 from l3ps_platform.errors import NotFound
 
 
@@ -28,6 +28,15 @@ def of_job(session: Session, job_id: str) -> list[StageRow]:
 def of_scene(session: Session, scene_id: str) -> list[StageRow]:
     """The stages of one scene, in order."""
     return list(session.scalars(select(StageRow).where(StageRow.scene_id == scene_id).order_by(StageRow.id)))
+
+
+def progress(session: Session, job_ids: Iterable[str]) -> dict[str, tuple[float, int]]:
+    """For each job how much of its stages is done, the running ones by their fraction, and how many there are."""
+    final = StageRow.state.in_([state for state in StageState if state.final])
+    share = case((final, 1.0), (StageRow.state == StageState.RUNNING, StageRow.fraction), else_=0.0)
+    query = select(StageRow.job_id, func.sum(share), func.count()).where(StageRow.job_id.in_(set(job_ids)))
+    rows = session.execute(query.group_by(StageRow.job_id)).tuples()
+    return {job_id: (float(done), count) for job_id, done, count in rows if job_id is not None}
 
 
 def ingest_of(session: Session, *, drive_id: str | None = None, model_id: str | None = None) -> StageRow | None:

@@ -26,13 +26,16 @@ def add(
     s3_upload_id: str,
     seconds: int,
     id: str | None = None,
+    sha256: str | None = None,
 ) -> UploadRow:
-    """A new open upload that expires after ``seconds``; ``id`` where the key was made from it beforehand."""
+    """A new open upload that expires after ``seconds``; ``id`` where the key was made from it beforehand,
+    ``sha256`` as the client claims it."""
     row = UploadRow(
         id=id or new_id("upl"),
         kind=kind,
         filename=filename,
         size=size,
+        sha256=sha256,
         parts=parts,
         state=UploadState.OPEN,
         object_key=object_key,

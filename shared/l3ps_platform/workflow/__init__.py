@@ -18,6 +18,7 @@ from l3ps_platform.workflow.outcomes import (
     drive_checked,
     fail,
     model_checked,
+    release,
 )
 from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
@@ -42,6 +43,7 @@ __all__ = [
     "lease_lost",
     "model_checked",
     "problems_of",
+    "release",
     "report",
     "submit_job",
 ]

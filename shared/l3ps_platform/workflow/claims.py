@@ -68,6 +68,7 @@ def claim(
         "progress_step": None,
         "progress_done": 0,
         "progress_total": 0,
+        "fraction": 0.0,
     }
     mine = (StageRow.id == stage_id, StageRow.attempt == attempt)
     if changed(tx, update(StageRow).where(*mine, StageRow.state == StageState.QUEUED).values(**lease)):
@@ -100,14 +101,21 @@ def heartbeat(tx: Transaction, claim: Claim) -> None:
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
 
 
-def report(tx: Transaction, claim: Claim, step: str, done: int, total: int) -> None:
+def report(tx: Transaction, claim: Claim, step: str, done: int, total: int, *, fraction: float) -> None:
     """Record progress and prolong the lease.
+
+    Args:
+        tx: the transaction.
+        claim: the stage.
+        step: what the method is doing.
+        done, total: units of that step.
+        fraction: 0..1, over all steps of the stage.
 
     Raises:
         LeaseLost: the stage is no longer ours.
         Cancelled: the job was cancelled.
     """
-    progress = {"progress_step": step[:32], "progress_done": done, "progress_total": total}
+    progress = {"progress_step": step[:32], "progress_done": done, "progress_total": total, "fraction": fraction}
     if not changed(tx, update(StageRow).where(*owned(claim)).values(lease_until=_until(tx, claim), **progress)):
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
     check_cancelled(tx, claim)

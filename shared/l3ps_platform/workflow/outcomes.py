@@ -156,6 +156,16 @@ def cancelled(tx: Transaction, claim: Claim, cost: Cost | None = None) -> None:
     settle_job(tx, jobs.lock(tx.session, _must(stage.job_id)))
 
 
+def release(tx: Transaction, claim: Claim) -> None:
+    """Give a stage back because this worker stops: it is queued again and no attempt is counted. LeaseLost."""
+    stage = _finish(tx, claim, StageState.QUEUED)
+    job = lock_parents(tx, stage)
+    if job is not None and job.cancel_requested:
+        failed(tx, stage, None)
+    else:
+        enqueue(tx, stage)
+
+
 def cancel_job(tx: Transaction, job_id: str) -> JobRow:
     """Stop a job: what has not begun never will, what runs stops at its next scan. A finished job stays as it is.
 
@@ -192,10 +202,12 @@ def _finish(
         raise LeaseLost(f"stage {claim.stage_id} is gone")
     lock_parents(tx, stage)
     values: dict[str, object] = {"state": state, "lease_owner": None, "lease_until": None, "error": error}
-    values |= {"output_key": output_key, "finished_at": tx.now}
+    values |= {"output_key": output_key, "finished_at": tx.now if state.final else None}
     if cost is not None:
         values |= {"seconds": cost.seconds, "cpu_seconds": cost.cpu_seconds, "peak_mb": cost.peak_mb}
         values |= {"scans": cost.scans, "points": cost.points, "cached": cost.cached}
+    if state is StageState.DONE:
+        values["fraction"] = 1.0
     if not changed(tx, update(StageRow).where(*owned(claim)).values(**values)):
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
     if cost is not None:

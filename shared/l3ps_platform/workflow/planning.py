@@ -14,16 +14,20 @@ from l3ps_platform.errors import NotFound
 from l3ps_platform.ids import new_id
 
 
-def accept_drive(tx: Transaction, *, name: str, filename: str, size: int, object_key: str) -> DriveRow:
-    """Record an uploaded archive and have it checked."""
-    row = drives.add(tx, name=name, filename=filename, size=size, object_key=object_key)
+def accept_drive(
+    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+) -> DriveRow:
+    """Record an uploaded archive and have it checked; ``sha256`` as the client claims it."""
+    row = drives.add(tx, name=name, filename=filename, size=size, object_key=object_key, sha256=sha256)
     enqueue(tx, add_stage(tx, StageName.INGEST, drive_id=row.id))
     return row
 
 
-def accept_model(tx: Transaction, *, name: str, filename: str, size: int, object_key: str) -> ModelRow:
+def accept_model(
+    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+) -> ModelRow:
     """Record an uploaded bundle and have it checked. Conflict when the name is taken."""
-    row = bundles.add(tx, name=name, filename=filename, size=size, object_key=object_key)
+    row = bundles.add(tx, name=name, filename=filename, size=size, object_key=object_key, sha256=sha256)
     enqueue(tx, add_stage(tx, StageName.INGEST, model_id=row.id))
     return row
 
@@ -119,6 +123,7 @@ def add_stage(tx: Transaction, name: StageName, **owner: str) -> StageRow:
     """A stage that waits; ``owner`` names its job, scene, drive or model."""
     row = StageRow(id=new_id("stg"), name=name, queue=QUEUE_OF[name], state=StageState.WAITING, attempt=1, **owner)
     row.progress_done = row.progress_total = 0
+    row.fraction = 0.0
     row.cached = False
     tx.session.add(row)
     tx.session.flush()

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
 
 import structlog
 from sqlalchemy import select, update
@@ -19,11 +20,13 @@ from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
 from l3ps_platform.catalog.states import QueueName, StageState, UploadState
 from l3ps_platform.errors import Conflict, PlatformError
 from l3ps_platform.objects import ObjectStore
-from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 from l3ps_platform.workflow.claims import changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
+
+if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it
+    from l3ps_platform.queue import Queue
 
 log = structlog.get_logger(__name__)
 
