@@ -76,8 +76,8 @@ def create_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     services: Services = app.state.services
-    if services.catalog.engine.dialect.name == "sqlite":
-        await run_in_threadpool(upgrade, services.settings.catalog_url)  # embedded: there is no deployment step
+    if services.settings.migrates_on_start:
+        await run_in_threadpool(upgrade, services.settings.catalog_url)
     try:
         await run_in_threadpool(services.store.ensure)
     except StoreUnavailable as error:
