@@ -33,11 +33,11 @@ def project(
         (N, 2) float64 pixel coordinates (u right, v down), (N,) float64 depth in metres along the optical axis, and
         (N,) bool whether the point falls into the image. Coordinates of points that do not are meaningless.
     """
-    camera = xyz.astype(np.float64) @ lidar_to_camera[:3, :3].T + lidar_to_camera[:3, 3]
-    depth = camera[:, 2]
-    ahead = depth > MIN_DEPTH
-    uvw = camera @ intrinsic.T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # points that are not finite fail every comparison below
+        camera = xyz.astype(np.float64) @ lidar_to_camera[:3, :3].T + lidar_to_camera[:3, 3]
+        depth = camera[:, 2]
+        ahead = depth > MIN_DEPTH
+        uvw = camera @ intrinsic.T
         uv = uvw[:, :2] / uvw[:, 2:]
         inside = (uv > MARGIN).all(axis=1) & (uv[:, 0] < size[0] - MARGIN) & (uv[:, 1] < size[1] - MARGIN)
     return uv, depth, ahead & inside

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from l3ps.errors import DriveLogError, Problem
 from l3ps.segment.bundle import InputSpec
@@ -19,28 +19,23 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
         DriveLogError: when the file is missing or cannot be decoded.
     """
     try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"), dtype=np.uint8)
+    except FileNotFoundError as error:
         raise DriveLogError(
-            Problem("missing-image", path.name, f"the image cannot be read ({error.strerror})", "Restore the file.")
+            Problem("missing-image", path.name, "the image file is not there", "Restore the file.")
         ) from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if image is None:
-        raise DriveLogError(
-            Problem(
-                "broken-image",
-                path.name,
-                f"its {data.size} bytes cannot be decoded as an image",
-                "Replace the file by a complete JPEG or PNG.",
-            )
-        )
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        what = f"it cannot be decoded as an image ({error})"
+        remedy = "Replace the file by a complete JPEG or PNG."
+        raise DriveLogError(Problem("broken-image", path.name, what, remedy)) from error
 
 
 def network_input(image: NDArray[np.uint8], spec: InputSpec) -> NDArray[np.float32]:
     """Resize and normalise an image for a network.
 
-    Shrinking averages over the covered area, so that fine texture does not alias into false classes.
+    Shrinking averages over the covered area (Pillow's bilinear filter), as in the networks' own training pipelines,
+    so that fine texture does not alias into false classes.
 
     Args:
         image: (H, W, 3) uint8 RGB.
@@ -49,9 +44,7 @@ def network_input(image: NDArray[np.uint8], spec: InputSpec) -> NDArray[np.float
     Returns:
         (1, 3, height, width) float32.
     """
-    shrinks = image.shape[1] > spec.width or image.shape[0] > spec.height
-    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    resized = cv2.resize(image, (spec.width, spec.height), interpolation=interpolation)
+    resized = np.asarray(Image.fromarray(image).resize((spec.width, spec.height), Image.Resampling.BILINEAR))
     scale = 1 / 255 if spec.range == "0..1" else 1.0
     std = np.asarray(spec.std, dtype=np.float32)
     # One multiply-add a channel: (x * scale - mean) / std.
