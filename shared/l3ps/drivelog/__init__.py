@@ -5,6 +5,7 @@ from .archive_formats import sniff
 from .open import open_drive
 from .types import CameraFrame, Drive, LogFormat, Points, Scan, Scene, Truth
 from .unpack import UnpackLimits, check_kind, opened, unpack
+from .validate import validate, without_bad_scans
 
 __all__ = [
     "ArchiveKind",
@@ -21,4 +22,6 @@ __all__ = [
     "opened",
     "sniff",
     "unpack",
+    "validate",
+    "without_bad_scans",
 ]

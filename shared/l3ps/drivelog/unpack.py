@@ -140,6 +140,7 @@ def opened(
     limits: UnpackLimits = UnpackLimits(),
     *,
     sweeps: bool = False,
+    skip_bad_scans: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Drive]:
     """A drive from a folder or an archive; what was unpacked is removed at the end.
@@ -149,19 +150,20 @@ def opened(
         scratch: where to unpack; the system's temporary folder when None.
         limits: what an archive may grow to.
         sweeps: as for :func:`open_drive`.
+        skip_bad_scans: as for :func:`open_drive`.
         progress: as for :func:`unpack`.
 
     Raises:
         DriveLogError: no such log or archive, or one that cannot be used.
     """
     if not path.is_file():
-        yield open_drive(path, sweeps=sweeps)
+        yield open_drive(path, sweeps=sweeps, skip_bad_scans=skip_bad_scans)
         return
     if scratch is not None:
         scratch.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="drive-", dir=scratch) as folder:
         root = unpack(path, Path(folder) / "log", limits, progress=progress)
-        yield open_drive(root, sweeps=sweeps)
+        yield open_drive(root, sweeps=sweeps, skip_bad_scans=skip_bad_scans)
 
 
 def _kind(head: bytes, size: int) -> Kind:
