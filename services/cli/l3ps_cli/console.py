@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 import typer
-from l3ps.errors import InputError
 from rich.console import Console
 
+from l3ps.errors import InputError
 from l3ps_cli.client import ServiceProblemError, ServiceUnreachableError
 
 out = Console()

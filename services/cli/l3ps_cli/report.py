@@ -16,7 +16,9 @@ def quality_table(quality: dict[str, Any]) -> Table:
         quality: a job's ``quality``: ``protocol``, ``primal`` and ``refined``, each with ``pq``, ``miou``, ``classes``.
     """
     primal, refined = quality["primal"], quality["refined"]
-    table = Table(title=f"Quality against the log's truth, protocol {quality['protocol']}, per cent", title_justify="left")
+    table = Table(
+        title=f"Quality against the log's truth, protocol {quality['protocol']}, per cent", title_justify="left"
+    )
     table.add_column("class")
     for name in ("PQ primal", "PQ refined", "", "IoU primal", "IoU refined", ""):
         table.add_column(name, justify="right")
@@ -47,7 +49,11 @@ def stage_table(job: dict[str, Any]) -> Table:
 def _classes(primal: dict[str, Any], refined: dict[str, Any]) -> list[str]:
     """Classes that have truth or were predicted, in the label space's order."""
     names = list(dict.fromkeys([*primal["classes"], *refined["classes"]]))
-    return [name for name in names if any((side["classes"].get(name) or {}).get("iou") is not None for side in (primal, refined))]
+    return [
+        name
+        for name in names
+        if any((side["classes"].get(name) or {}).get("iou") is not None for side in (primal, refined))
+    ]
 
 
 def _pair(before: float | None, after: float | None) -> tuple[str, str, str]:
