@@ -19,7 +19,7 @@ class ClassQuality:
         tp: matched segments.
         fp: predicted segments of the protocol's minimum size without a match.
         fn: truth segments of the protocol's minimum size without a match.
-        truth_segments: truth segments of the protocol's minimum size; 0 keeps the class out of the means.
+        truth_segments: truth segments of the protocol's minimum size.
         is_thing: whether the class is a thing.
     """
 
@@ -33,10 +33,19 @@ class ClassQuality:
     truth_segments: int
     is_thing: bool
 
+    @property
+    def counted(self) -> bool:
+        """Whether the means run over this class: it has a truth segment that counts.
+
+        That is one of the minimum size, or a smaller one that was matched: the official evaluation takes it as a true
+        positive, and leaving its class out would hide it.
+        """
+        return self.truth_segments > 0 or bool(self.tp)
+
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """Figures of one evaluation. Means run over the classes that have a truth segment of the minimum size.
+    """Figures of one evaluation. Means run over the classes with a truth segment that counts.
 
     Attributes:
         protocol: name of the protocol the figures were made under.
@@ -67,7 +76,7 @@ class Quality:
     @classmethod
     def of(cls, protocol: str, scans: int, points: int, unlabelled: float, classes: dict[str, ClassQuality]) -> Quality:
         """Average the classes into a :class:`Quality`."""
-        counted = [c for c in classes.values() if c.truth_segments > 0]
+        counted = [c for c in classes.values() if c.counted]
         return cls(
             protocol=protocol,
             pq=_mean(c.pq for c in counted),
@@ -85,7 +94,7 @@ class Quality:
     @property
     def things_unscored(self) -> tuple[str, ...]:
         """Classes present in the truth whose PQ cannot be computed because the truth has no instances of them."""
-        return tuple(name for name, c in self.classes.items() if c.truth_segments > 0 and c.pq is None)
+        return tuple(name for name, c in self.classes.items() if c.counted and c.pq is None)
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as plain data for JSON, in per cent, unrounded; None where a figure cannot be computed."""

@@ -46,13 +46,14 @@ def cluster_scene(
         clusterer: the implementation.
 
     Returns:
-        (N,) int32 cluster ids from 0, unique over both partitions. A partition in which no cluster was found keeps
-        -1: nothing groups its points.
+        (N,) int32 cluster ids from 0, unique over both partitions. Points that are not finite keep -1, as do those of
+        a partition in which no cluster was found: nothing groups them.
     """
     labels = np.full(len(points), NOISE, dtype=np.int32)
     first_free = 0
+    finite = np.isfinite(points).all(axis=1)
     for partition in (~ground, ground):
-        members = np.flatnonzero(partition)
+        members = np.flatnonzero(partition & finite)
         if len(members) == 0:
             continue
         own = points[members]
