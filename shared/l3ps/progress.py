@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
 
 
 class Progress(Protocol):
@@ -14,3 +17,10 @@ class Progress(Protocol):
 
 def silent(stage: str, done: int, total: int) -> None:
     """The progress of a caller who does not want any."""
+
+
+def track(items: Sequence[T], stage: str, progress: Progress) -> Iterator[T]:
+    """Iterate over ``items`` and report each as done when the next one is asked for."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        progress(stage, done, len(items))

@@ -238,9 +238,19 @@ NUSCENES16_TO_SEMANTICKITTI19: tuple[int, ...] = (0, 14, 2, 5, 1, 5, 3, 6, 0, 5,
 manmade → building (poles and signs are lost in it); traffic cone has no counterpart and becomes void."""
 
 SEMANTICKITTI19_TO_NUSCENES16: tuple[int, ...] = (
-    0, 4, 2, 6, 10, 5, 7, 2, 6, 11, 11, 13, 12, 15, 15, 16, 16, 14, 15, 15,
+    0, 4, 2, 6, 10, 0, 7, 2, 6, 11, 11, 13, 12, 15, 15, 16, 16, 14, 15, 15,
 )  # fmt: skip
-"""The 19 → nearest challenge class; riders count to their vehicle as in nuScenes."""
+"""The 19 → nearest challenge class; riders count to their vehicle as in nuScenes. Void for other-vehicle, which may be
+a bus, a trailer or a tram: no single class is right for it, and a wrong truth is worse than none."""
+
+NUSCENES16_TO_SEMANTICKITTI_RAW: tuple[int, ...] = (
+    0, 51, 11, 13, 10, 20, 15, 30, 99, 20, 18, 40, 49, 48, 72, 50, 70,
+)  # fmt: skip
+"""Challenge class → raw id written for it. Finer than the 19 where the raw ids are: bus is 13 (bus), a traffic cone 99
+(other-object); both fall where ``NUSCENES16_TO_SEMANTICKITTI19`` puts them once the learning map is applied."""
+
+_SEMANTICKITTI_RAW_VEHICLES: dict[int, int] = {13: 3, 257: 3}
+"""Raw ids of other-vehicle that do say which challenge class: bus and moving bus."""
 
 
 def nuscenes_raw_lut(category_index: dict[str, int]) -> NDArray[np.uint8]:
@@ -263,6 +273,14 @@ def semantickitti_raw_lut() -> NDArray[np.uint8]:
     lut = np.zeros(1 << 16, dtype=np.uint8)
     for raw, train in SEMANTICKITTI_RAW_TO_19.items():
         lut[raw] = train
+    return lut
+
+
+def semantickitti_raw_to_nuscenes16_lut() -> NDArray[np.uint8]:
+    """(65536,) uint8 lookup table raw SemanticKITTI id → challenge class; what has no counterpart maps to void."""
+    lut = np.asarray(SEMANTICKITTI19_TO_NUSCENES16, dtype=np.uint8)[semantickitti_raw_lut()]
+    for raw, index in _SEMANTICKITTI_RAW_VEHICLES.items():
+        lut[raw] = index
     return lut
 
 

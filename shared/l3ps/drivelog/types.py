@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import Problem
+
 LogFormat = Literal["nuscenes", "kitti-raw", "semantickitti"]
 Matrix = NDArray[np.float64]
 
@@ -89,6 +91,9 @@ class Scan:
         ego_to_world: the ego pose at the scan's time, or None where the log has no poses.
         cameras: the exposures matched to this scan; empty for a sweep between keyframes.
         is_keyframe: False for intermediate sweeps, which have no truth and get no label files unless asked.
+        number: the scan's name within its scene where the format counts its files (``000007``), else None. Label
+            files of a SemanticKITTI log are named after it.
+        truth_path: the file the truth is read from, or None.
         load_points: reads the points; DriveLogError when the file is missing, truncated or not numeric.
         load_truth: reads the truth, or None where the scan has none.
     """
@@ -103,6 +108,8 @@ class Scan:
     load_points: Callable[[], Points] = field(repr=False)
     load_truth: Callable[[], Truth] | None = field(default=None, repr=False)
     is_keyframe: bool = True
+    number: str | None = None
+    truth_path: Path | None = None
 
     def lidar_to_camera(self, camera: CameraFrame) -> Matrix:
         """Transform lidar → ego → world → ego at exposure → camera (METHOD: projection).
@@ -133,6 +140,8 @@ class Drive:
         scenes: the scenes, in the log's order.
         truth_space: name of the label space of its truth (``nuscenes`` or ``semantickitti``).
         sensor_height: height of the LiDAR above ground in metres where calibration tells it, else None.
+        problems: what the reader could not resolve while it opened the log. The scans and images concerned are not
+            among the scenes; :func:`l3ps.drivelog.validate` repeats these problems before its own.
     """
 
     root: Path
@@ -140,6 +149,7 @@ class Drive:
     scenes: tuple[Scene, ...]
     truth_space: Literal["nuscenes", "semantickitti"]
     sensor_height: float | None = None
+    problems: tuple[Problem, ...] = ()
 
     @property
     def has_truth(self) -> bool:

@@ -1,1 +1,18 @@
 """Label files: one writer and reader a format."""
+
+from l3ps.labels.poses import read_poses, write_poses
+from l3ps.labels.reader import LabelFolder, open_labels, read_scan
+from l3ps.labels.types import ScanLabels
+from l3ps.labels.writer import FORMATS, LabelFormat, write_scene
+
+__all__ = [
+    "FORMATS",
+    "LabelFolder",
+    "LabelFormat",
+    "ScanLabels",
+    "open_labels",
+    "read_poses",
+    "read_scan",
+    "write_poses",
+    "write_scene",
+]

@@ -1,0 +1,50 @@
+# One command each: `make demo` runs the main job, `make test` proves the project. Both set up what they need.
+
+export UV ?= $(or $(shell command -v uv 2>/dev/null),$(CURDIR)/.tools/bin/uv)
+PYTHON ?= python3
+RUN = $(UV) run --no-sync
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format setup setup-dev servers compose-check demo-model clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: setup ## label a simulated drive through the service; DRIVE=log MODEL=bundle take your own
+	$(RUN) l3ps demo $(if $(DRIVE),--drive "$(DRIVE)") $(if $(MODEL),--model "$(MODEL)")
+
+test: lint servers ## style, types, import rules and every test
+	$(RUN) pytest
+
+lint: setup-dev
+	$(RUN) ruff check .
+	$(RUN) ruff format --check .
+	$(RUN) mypy shared/l3ps shared/l3ps_platform
+	$(RUN) lint-imports
+
+format: setup-dev ## put the code into the house style
+	$(RUN) ruff check --fix .
+	$(RUN) ruff format .
+
+servers: setup-dev
+	$(RUN) python tests/setup_servers.py
+
+setup: $(UV)
+	$(UV) sync --frozen --inexact --no-dev --package l3ps-cli --package l3ps-api --package l3ps-worker
+
+setup-dev: $(UV)
+	$(UV) sync --frozen --all-packages
+
+# Without uv on the machine: the one from the Python package index, in a folder of its own.
+$(CURDIR)/.tools/bin/uv:
+	$(PYTHON) -m venv $(CURDIR)/.tools
+	$(CURDIR)/.tools/bin/pip install --quiet 'uv>=0.9'
+
+compose-check: setup-dev ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
+	deploy/compose_check.sh
+
+demo-model: setup-dev ## train the demo's model again from simulated images
+	$(RUN) python -m l3ps_trainer.demo_model --out services/cli/l3ps_cli/models/demo
+
+clean: ## remove what the targets made here
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo

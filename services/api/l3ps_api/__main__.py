@@ -1,0 +1,28 @@
+"""``python -m l3ps_api``: the API in one uvicorn process, as the settings say."""
+
+from __future__ import annotations
+
+import uvicorn
+from l3ps_platform.settings import get_settings
+from l3ps_platform.telemetry import configure_logging
+
+from l3ps_api.app import create_app
+
+
+def main() -> None:
+    """Serve until SIGTERM or SIGINT."""
+    settings = get_settings()
+    configure_logging(settings)
+    uvicorn.run(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=5,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""The application: what is mounted where, and what lives as long as the process."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+import structlog
+from fastapi import Depends, FastAPI
+from fastapi.concurrency import run_in_threadpool
+from l3ps_platform.catalog import Catalog
+from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.errors import StoreUnavailable
+from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.objects import open_store
+from l3ps_platform.queue import Queue
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import Reconciler
+from prometheus_client import CollectorRegistry
+
+from l3ps_api import errors, problems
+from l3ps_api.auth import require_token
+from l3ps_api.drives.routes import router as drives
+from l3ps_api.jobs.routes import router as jobs
+from l3ps_api.labels.routes import router as labels
+from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
+from l3ps_api.models.routes import router as models
+from l3ps_api.objects.routes import router as objects
+from l3ps_api.services import Services
+from l3ps_api.system.routes import health_router, metrics_router
+from l3ps_api.uploads.routes import router as uploads
+
+log = structlog.get_logger(__name__)
+
+DESCRIPTION = """
+Drive logs in, panoptic labels on every LiDAR point out.
+
+1. `POST /v1/uploads` announces an archive; `PUT` its parts to the URLs answered; `POST …/complete` makes it a drive.
+2. `POST /v1/jobs` labels a drive with a model; `GET /v1/jobs/{id}` shows progress, cost and quality.
+3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs.
+
+Every error is a problem document (RFC 9457) that names the field at fault and the remedy.
+"""
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The API of one service."""
+    queue = Queue(settings)
+    catalog = Catalog(settings.catalog_url, sender=queue.send)
+    services = Services(settings, catalog, open_store(settings), queue)
+    app = FastAPI(
+        title="l3ps", version=version("l3ps-api"), description=DESCRIPTION.strip(), lifespan=_lifespan, redoc_url=None
+    )
+    app.state.services = services
+    app.state.token = settings.token.get_secret_value() if settings.token else None
+    app.state.registry = CollectorRegistry()
+    app.state.registry.register(CatalogCollector(catalog, queue, settings))
+    guarded = [Depends(require_token)]
+    app.include_router(health_router)
+    app.include_router(metrics_router, dependencies=guarded)
+    app.include_router(objects)  # its URLs are signed, each for one act
+    for router in (uploads, drives, jobs, labels, models):
+        app.include_router(router, dependencies=guarded)
+    # The last added is the first to see a request.
+    app.add_middleware(BodyLimit, exempt="/v1/objects/")
+    if settings.host in ("127.0.0.1", "localhost", "::1") and not settings.public_url:
+        app.add_middleware(LoopbackHosts)
+    app.add_middleware(RequestMetrics, registry=app.state.registry)
+    errors.install(app)
+    problems.describe_in_openapi(app)
+    return app
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    services: Services = app.state.services
+    if services.catalog.engine.dialect.name == "sqlite":
+        await run_in_threadpool(upgrade, services.settings.catalog_url)  # embedded: there is no deployment step
+    try:
+        await run_in_threadpool(services.store.ensure)
+    except StoreUnavailable as error:
+        log.warning("object store not reached at the start, /readyz tries again", reason=str(error))
+    stop = threading.Event()
+    reconciler = Reconciler(services.catalog, services.queue, services.store, services.settings)
+    broom = threading.Thread(target=reconciler.run, args=(stop,), name="reconciler", daemon=True)
+    broom.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        await run_in_threadpool(broom.join, 10)
+        services.catalog.dispose()
+        services.queue.close()

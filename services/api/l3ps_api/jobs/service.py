@@ -1,0 +1,119 @@
+"""Jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from l3ps.errors import InputError
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StageState, StepRow, bundles, drives, jobs, stages
+from l3ps_platform.workflow import cancel_job, submit_job
+from sqlalchemy.orm import Session
+
+from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
+from l3ps_api.problems import ApiProblem, items
+from l3ps_api.services import Services
+
+
+def create(services: Services, request: JobRequest) -> Job:
+    """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
+    try:
+        with services.catalog.transaction() as tx:
+            job = submit_job(tx, **request.model_dump())
+    except InputError as error:
+        found = error.problems
+        count = "one problem" if len(found) == 1 else f"{len(found)} problems"
+        skippable = all(problem.severity == "scan" for problem in found)
+        remedy = "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
+        detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
+        raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
+    return get(services, job.id)
+
+
+def page(services: Services, limit: int, cursor: str | None, state: JobState | None) -> JobPage:
+    """One page, newest first."""
+    with services.catalog.reading() as session:
+        rows = jobs.page(session, limit=limit + 1, before=cursor, state=state)
+        shown = rows[:limit]
+        of_drive = drives.many(session, [row.drive_id for row in shown])
+        of_model = bundles.many(session, [row.model_id for row in shown])
+        progress = stages.progress(session, [row.id for row in shown])
+    summaries = [
+        JobSummary(**summary_fields(row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress[row.id])))
+        for row in shown
+    ]
+    return JobPage(items=summaries, next=shown[-1].id if len(rows) > limit else None)
+
+
+def get(services: Services, job_id: str) -> Job:
+    """One job in full. NotFound."""
+    with services.catalog.reading() as session:
+        return _document(session, jobs.get(session, job_id))
+
+
+def cancel(services: Services, job_id: str) -> Job:
+    """Ask a job to stop. NotFound, Conflict when it is over."""
+    with services.catalog.transaction() as tx:
+        cancel_job(tx, job_id)
+    return get(services, job_id)
+
+
+def _document(session: Session, job: JobRow) -> Job:
+    planned = stages.of_job(session, job.id)
+    ingest = stages.ingest_of(session, drive_id=job.drive_id)
+    rows = [ingest, *planned] if ingest is not None else planned
+    steps = stages.steps(session, [row.id for row in rows])
+    drive = drives.many(session, [job.drive_id])[job.drive_id]
+    model = bundles.get(session, job.model_id)
+    done = sum(_done(row) for row in planned)
+
+    def shown(chosen: Iterable[StageRow]) -> list[Stage]:
+        return [_stage(row, steps[row.id]) for row in chosen]
+
+    scenes = [
+        Scene(
+            id=scene.id,
+            name=scene.name,
+            position=scene.position,
+            scans=scene.scans,
+            points=scene.points,
+            state=scene.state,
+            stages=shown(row for row in planned if row.scene_id == scene.id),
+        )
+        for scene in jobs.scenes(session, job.id)
+    ]
+    own = shown(row for row in rows if row.scene_id is None)
+    return Job(**summary_fields(job, drive, model, _share(job, done, len(planned))), stages=own, scenes=scenes)
+
+
+def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
+    return Stage(
+        id=row.id,
+        name=row.name,
+        state=row.state,
+        attempt=row.attempt,
+        step=row.progress_step,
+        done=row.progress_done,
+        total=row.progress_total,
+        cached=row.cached,
+        seconds=row.seconds,
+        cpu_seconds=row.cpu_seconds,
+        peak_mb=row.peak_mb,
+        points=row.points,
+        message=(row.error or {}).get("message"),
+        started_at=row.started_at,
+        finished_at=row.finished_at,
+        steps=[Step(name=step.name, seconds=step.seconds, peak_mb=step.peak_mb) for step in steps],
+    )
+
+
+def _done(row: StageRow) -> float:
+    """How much of a stage is done, 0 to 1, its current step taken for the whole."""
+    if row.state is StageState.DONE:
+        return 1.0
+    return min(1.0, row.progress_done / row.progress_total) if row.progress_total else 0.0
+
+
+def _share(job: JobRow, done: float, total: int) -> float:
+    if job.state is JobState.SUCCEEDED:
+        return 1.0
+    return min(1.0, done / total) if total else 0.0

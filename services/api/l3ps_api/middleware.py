@@ -1,0 +1,105 @@
+"""What every request passes before it reaches a route: measurement, a guard of the host name, a limit of the body."""
+
+from __future__ import annotations
+
+import time
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from l3ps_api.problems import ApiProblem, answer, too_large
+
+JSON_BODY_BYTES = 2 << 20
+"""The largest JSON body taken: the completion of an upload of 10,000 parts is below 1 MB."""
+
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_LOOPBACK = {"127.0.0.1", "localhost", "[::1]"}
+
+
+class RequestMetrics:
+    """Counts and times requests by method, route template and status."""
+
+    def __init__(self, app: ASGIApp, registry: CollectorRegistry) -> None:
+        self.app = app
+        labels = ("method", "route")
+        self.requests = Counter(
+            "l3ps_http_requests", "Requests answered.", (*labels, "status"), registry=registry
+        )
+        self.seconds = Histogram("l3ps_http_request_seconds", "Time to answer.", labels, registry=registry)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        start, status = time.perf_counter(), 500
+
+        async def observed(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self.app(scope, receive, observed)
+        finally:
+            # Templates, not paths: a path holds ids, and every id would be a time series of its own.
+            route = getattr(scope.get("route"), "path", "unknown")
+            method = scope["method"] if scope["method"] in _METHODS else "other"
+            self.requests.labels(method, route, status).inc()
+            self.seconds.labels(method, route).observe(time.perf_counter() - start)
+
+
+class LoopbackHosts:
+    """On a loopback address, answers only to loopback names.
+
+    Without it any web page could reach a tokenless local service by making its own name resolve to 127.0.0.1.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            host = next((value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), "")
+            name = host if host.endswith("]") else host.rpartition(":")[0] or host
+            if name.lower() not in _LOOPBACK:
+                problem = ApiProblem(
+                    421,
+                    "foreign-host",
+                    "Wrong host name",
+                    f"This service listens on the loopback interface and does not answer to the name {name!r}. "
+                    "Use 127.0.0.1 or localhost, or start it with L3PS_HOST set to the address it is to serve.",
+                )
+                await answer(problem, scope["path"])(scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+
+class BodyLimit:
+    """Refuses JSON bodies that are too large, before they are read where their length is declared."""
+
+    def __init__(self, app: ASGIApp, exempt: str) -> None:
+        self.app, self.exempt = app, exempt
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"].startswith(self.exempt):
+            await self.app(scope, receive, send)
+            return
+        what = f"the body is larger than {JSON_BODY_BYTES} bytes"
+        remedy = "Drive logs and models go to the part URLs that POST /v1/uploads hands out."
+        declared = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
+        if declared.isdigit() and int(declared) > JSON_BODY_BYTES:
+            await answer(too_large("body", what, remedy), scope["path"])(scope, receive, send)
+            return
+        received = 0
+
+        async def limited() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > JSON_BODY_BYTES:
+                raise HTTPException(413, f"body: {what}. {remedy}")
+            return message
+
+        await self.app(scope, limited, send)

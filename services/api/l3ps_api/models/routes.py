@@ -1,0 +1,23 @@
+"""Model bundles that the service knows."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from l3ps_api.models import service
+from l3ps_api.models.schemas import Model, ModelPage
+from l3ps_api.services import Cursor, Limit, ServicesDep
+
+router = APIRouter(prefix="/v1/models", tags=["models"])
+
+
+@router.get("")
+def list_models(services: ServicesDep, limit: Limit = 50, cursor: Cursor = None) -> ModelPage:
+    """Models, newest first. A new one comes as an upload of kind `model`."""
+    return service.page(services, limit, cursor)
+
+
+@router.get("/{model}")
+def get_model(model: str, services: ServicesDep) -> Model:
+    """A model by its name or id."""
+    return service.get(services, model)

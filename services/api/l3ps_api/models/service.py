@@ -1,0 +1,22 @@
+"""Model bundles."""
+
+from __future__ import annotations
+
+from l3ps_platform.catalog import bundles
+
+from l3ps_api.models.schemas import Model, ModelPage
+from l3ps_api.services import Services
+
+
+def page(services: Services, limit: int, cursor: str | None) -> ModelPage:
+    """One page, newest first."""
+    with services.catalog.reading() as session:
+        rows = bundles.page(session, limit=limit + 1, before=cursor)
+    shown = rows[:limit]
+    return ModelPage(items=[Model.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+
+
+def get(services: Services, model: str) -> Model:
+    """One model by name or id. NotFound."""
+    with services.catalog.reading() as session:
+        return Model.of(bundles.by_name(session, model))

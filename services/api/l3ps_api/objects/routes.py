@@ -1,0 +1,25 @@
+"""The directory store's presigned URLs, answered as an S3 server would answer its own."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import FileResponse
+
+from l3ps_api.objects import service
+from l3ps_api.services import ServicesDep
+
+router = APIRouter(prefix="/v1/objects", tags=["objects"])
+
+
+@router.put("/{key:path}", status_code=200, response_class=Response)
+async def put_object(key: str, request: Request, services: ServicesDep) -> Response:
+    """Store the body as the object or part that the URL's signature permits; the answer's ETag names a part."""
+    grant = service.grant(services, "PUT", key, request.query_params)
+    etag = await service.receive(services, grant, request.headers.get("content-length"), request.stream())
+    return Response(headers={"ETag": f'"{etag}"'})
+
+
+@router.api_route("/{key:path}", methods=["GET", "HEAD"], response_class=FileResponse)
+def get_object(key: str, request: Request, services: ServicesDep) -> FileResponse:
+    """Send the object that the URL's signature permits; `Range` is honoured."""
+    return service.send(services, service.grant(services, request.method, key, request.query_params))

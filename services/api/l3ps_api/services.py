@@ -1,0 +1,32 @@
+"""What routes need of the platform, made once by the app factory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Query, Request
+from l3ps_platform.catalog.session import Catalog
+from l3ps_platform.objects import ObjectStore
+from l3ps_platform.queue import Queue
+from l3ps_platform.settings import Settings
+
+
+@dataclass(frozen=True)
+class Services:
+    """The process' connections; each connects on first use."""
+
+    settings: Settings
+    catalog: Catalog
+    store: ObjectStore
+    queue: Queue
+
+
+def _services(request: Request) -> Services:
+    found: Services = request.app.state.services
+    return found
+
+
+ServicesDep = Annotated[Services, Depends(_services)]
+Limit = Annotated[int, Query(ge=1, le=200, description="How many items at most.")]
+Cursor = Annotated[str | None, Query(description="`next` of the page before.", max_length=40)]

@@ -1,0 +1,42 @@
+"""Uploads: announce a file, PUT its parts to the URLs answered, complete."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from l3ps_api.drives.schemas import Drive
+from l3ps_api.models.schemas import Model
+from l3ps_api.services import ServicesDep
+from l3ps_api.uploads import service
+from l3ps_api.uploads.schemas import Completion, OpenUpload, Upload, UploadRequest
+
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
+
+
+@router.post("", status_code=201)
+def open_upload(request: UploadRequest, response: Response, services: ServicesDep) -> OpenUpload:
+    """Announce a file; the answer holds a presigned URL for each part."""
+    upload = service.open_upload(services, request)
+    response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    return upload
+
+
+@router.get("/{upload_id}")
+def get_upload(upload_id: str, services: ServicesDep) -> Upload:
+    """An upload's state."""
+    return service.get(services, upload_id)
+
+
+@router.post("/{upload_id}/complete", status_code=202)
+def complete_upload(upload_id: str, completion: Completion, response: Response, services: ServicesDep) -> Drive | Model:
+    """Join the parts. A file that is no archive is refused and forgotten; any other is checked by a worker."""
+    result = service.complete(services, upload_id, completion)
+    folder = "drives" if isinstance(result, Drive) else "models"
+    response.headers["Location"] = f"/v1/{folder}/{result.id}"
+    return result
+
+
+@router.delete("/{upload_id}", status_code=204)
+def abort_upload(upload_id: str, services: ServicesDep) -> None:
+    """Give an upload up; its parts are deleted."""
+    service.abort(services, upload_id)

@@ -1,0 +1,65 @@
+"""Uploads as clients see them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from l3ps_platform.catalog import UploadState
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+Kind = Literal["drive", "model"]
+Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
+
+
+class UploadRequest(BaseModel):
+    """The announcement of a file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    kind: Kind = Field(description="`drive`: an archive of a drive log; `model`: a zipped model bundle.")
+    filename: Name = Field(examples=["2026-11-22-morning.tar"])
+    size: int = Field(ge=0, description="Bytes.")
+
+
+class PartUrl(BaseModel):
+    number: int = Field(description="From 1.")
+    url: str = Field(description="Where to PUT the part's bytes, without further credentials.")
+
+
+class Upload(BaseModel):
+    """An upload in progress, or what became of it."""
+
+    id: str
+    kind: str
+    filename: str
+    size: int
+    state: UploadState
+    result_id: str | None = Field(default=None, description="The drive or model it became.")
+    created_at: datetime
+    expires_at: datetime
+
+
+class OpenUpload(Upload):
+    """A fresh upload with the URLs of its parts."""
+
+    part_size: int = Field(description="Bytes of every part but the last.")
+    parts: list[PartUrl]
+
+
+class PartTag(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    number: int = Field(ge=1, le=10_000)
+    etag: str = Field(min_length=1, max_length=200, description="The ETag that the PUT of the part answered.")
+
+
+class Completion(BaseModel):
+    """Says that all parts are there."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    parts: list[PartTag] = Field(min_length=1, max_length=10_000)
+    name: Name | None = Field(default=None, description="What to call it; default: the file's name without its suffix.")
+    sha256: Sha256 | None = Field(default=None, description="Of the whole file; checked before the log is used.")

@@ -1,0 +1,194 @@
+"""What happens at an upload, and what must not remain of a bad one."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+from l3ps.segment.bundle import MAX_MODEL_BYTES
+from l3ps_platform.catalog import Transaction, UploadRow, UploadState, bundles, drives, uploads
+from l3ps_platform.errors import Conflict, NotFound, UploadError
+from l3ps_platform.ids import new_id
+from l3ps_platform.objects import Part, segment
+from l3ps_platform.workflow import accept_drive, accept_model
+
+from l3ps_api.drives.schemas import Drive
+from l3ps_api.models.schemas import Model
+from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
+from l3ps_api.services import Services
+from l3ps_api.uploads.parts import part_count, part_size
+from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
+from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
+
+_PRESIGN_LIMIT = timedelta(days=7)
+"""S3's limit for the life of a presigned URL."""
+
+_ARCHIVE_REMEDY = "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst."
+_MODEL_REMEDY = "Upload a model bundle as .zip that holds model.onnx and model.json."
+_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.zst", ".tzst")
+
+
+def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
+    """Begin a multipart upload and presign its parts; refuses files that are empty or too large."""
+    settings = services.settings
+    limit = settings.upload_max_bytes if request.kind == "drive" else min(settings.upload_max_bytes, MAX_MODEL_BYTES)
+    if request.size == 0:
+        raise invalid("size", "the file is empty (0 bytes)", _remedy(request.kind), code="empty-upload")
+    if request.size > limit:
+        what = f"{request.size} bytes are more than the {limit} bytes a {request.kind} may have"
+        raise too_large("size", what, "Split the log into shorter drives, or raise L3PS_UPLOAD_MAX_BYTES.")
+    upload_id, count = new_id("upl"), part_count(request.size, settings)
+    key = f"uploads/{upload_id}/{segment(request.filename)}"
+    life = min(timedelta(hours=settings.upload_hours), _PRESIGN_LIMIT)
+    multipart = services.store.create_multipart(key)
+    try:
+        with services.catalog.transaction() as tx:
+            row = uploads.add(
+                tx,
+                id=upload_id,
+                kind=request.kind,
+                filename=request.filename,
+                size=request.size,
+                parts=count,
+                object_key=key,
+                s3_upload_id=multipart,
+                seconds=int(life.total_seconds()),
+            )
+    except BaseException:
+        services.store.abort_multipart(key, multipart)
+        raise
+    urls = [
+        PartUrl(
+            number=number,
+            url=services.store.presign_part(key, multipart, number, int(life.total_seconds())),
+        )
+        for number in range(1, count + 1)
+    ]
+    size = part_size(request.size, settings)
+    return OpenUpload(**_fields(row), part_size=size, parts=urls)
+
+
+def get(services: Services, upload_id: str) -> Upload:
+    """An upload's state."""
+    with services.catalog.reading() as session:
+        return Upload(**_fields(uploads.get(session, upload_id)))
+
+
+def abort(services: Services, upload_id: str) -> None:
+    """Give an open upload up."""
+    with services.catalog.transaction() as tx:
+        row = uploads.close(tx, upload_id, UploadState.ABORTED)
+    services.store.abort_multipart(row.object_key, row.s3_upload_id)
+
+
+def complete(services: Services, upload_id: str, completion: Completion) -> Drive | Model:
+    """Join the parts, look at the first bytes, and hand the file to the ingest stage.
+
+    May be repeated: a client that lost the answer gets the same drive or model again.
+    """
+    with services.catalog.reading() as session:
+        row = uploads.get(session, upload_id)
+    if row.state is UploadState.COMPLETE:
+        return _result(services, row)
+    if row.state is not UploadState.OPEN:
+        detail = f"Upload {upload_id} is {row.state}. Begin a new one with POST /v1/uploads."
+        raise conflict("upload-closed", "The upload is closed", detail)
+    # No row is held while the store joins the parts: that can take seconds, and SQLite has one lock for all writers.
+    _join(services, row, completion)
+    refusal = _look(services, row)
+    if refusal is not None:
+        _discard(services, row)
+        raise refusal
+    try:
+        with services.catalog.transaction() as tx:
+            result_id, kept = _accept(tx, row, completion)
+            uploads.close(tx, upload_id, UploadState.COMPLETE, result_id)
+    except Conflict as error:
+        return _lost_race_or_name(services, row, error)
+    if not kept:
+        services.store.delete(row.object_key)
+    with services.catalog.reading() as session:
+        return _result(services, uploads.get(session, upload_id))
+
+
+def _join(services: Services, row: UploadRow, completion: Completion) -> None:
+    numbers = [part.number for part in completion.parts]
+    if sorted(numbers) != list(range(1, row.parts + 1)):
+        what = f"the upload has the parts 1 to {row.parts}, each once; {len(numbers)} were named"
+        raise invalid("parts", what, "Name every part once, with the ETag its PUT answered.", code="invalid-parts")
+    try:
+        parts = [Part(part.number, part.etag) for part in completion.parts]
+        services.store.complete_multipart(row.object_key, row.s3_upload_id, parts)
+    except UploadError as error:
+        # An earlier try may have joined the parts and then lost its answer or its catalog.
+        if not services.store.exists(row.object_key):
+            remedy = "PUT the parts again and name each with the ETag of its answer."
+            raise invalid("parts", str(error), remedy, code="invalid-parts") from error
+
+
+def _look(services: Services, row: UploadRow) -> ApiProblem | None:
+    """What is plainly wrong with a joined file, found in its size and its first bytes."""
+    size = services.store.stat(row.object_key).size
+    if size != row.size:
+        what = f"{size} bytes arrived, {row.size} were announced"
+        return invalid("size", what, "Upload the file again; nothing was kept.", code="wrong-size")
+    head = services.store.get_bytes(row.object_key, 0, HEAD_BYTES)
+    kind = archive_kind(head)
+    if kind is None or (row.kind == "model" and kind != "zip"):
+        return invalid(row.filename, describe(head, row.kind), _remedy(row.kind), code="not-an-archive")
+    return None
+
+
+def _discard(services: Services, row: UploadRow) -> None:
+    with services.catalog.transaction() as tx:
+        uploads.close(tx, row.id, UploadState.ABORTED)
+    services.store.delete(row.object_key)
+
+
+def _accept(tx: Transaction, row: UploadRow, completion: Completion) -> tuple[str, bool]:
+    """Make the drive or model; returns its id and whether it keeps the uploaded object."""
+    file = {"filename": row.filename, "size": row.size, "object_key": row.object_key, "sha256": completion.sha256}
+    name = completion.name or _stem(row.filename)
+    if row.kind == "drive":
+        return accept_drive(tx, name=name, **file).id, True
+    try:
+        known = bundles.by_name(tx.session, name)
+    except NotFound:
+        return accept_model(tx, name=name, **file).id, True
+    if known.sha256 == completion.sha256 is not None and known.state != "rejected":
+        return known.id, False
+    return accept_model(tx, name=name, **file).id, True
+
+
+def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> Drive | Model:
+    """After a conflict: another request completed this upload meanwhile, or the model's name is taken."""
+    with services.catalog.reading() as session:
+        now = uploads.get(session, row.id)
+    if now.state is UploadState.COMPLETE:
+        return _result(services, now)
+    if now.state is UploadState.OPEN:
+        _discard(services, row)
+    detail = f"{str(error)[:1].upper()}{str(error)[1:]}. Nothing was kept."
+    raise conflict("name-taken", "The name is taken", detail, where="name", remedy="Choose another name.") from error
+
+
+def _result(services: Services, row: UploadRow) -> Drive | Model:
+    with services.catalog.reading() as session:
+        if row.kind == "drive":
+            return Drive.of(drives.get(session, row.result_id or ""))
+        return Model.of(bundles.get(session, row.result_id or ""))
+
+
+def _fields(row: UploadRow) -> dict[str, object]:
+    names = ("id", "kind", "filename", "size", "state", "result_id", "created_at", "expires_at")
+    return {name: getattr(row, name) for name in names}
+
+
+def _stem(filename: str) -> str:
+    for suffix in sorted(_SUFFIXES, key=len, reverse=True):
+        if filename.lower().endswith(suffix) and len(filename) > len(suffix):
+            return filename[: -len(suffix)]
+    return filename
+
+
+def _remedy(kind: str) -> str:
+    return _ARCHIVE_REMEDY if kind == "drive" else _MODEL_REMEDY

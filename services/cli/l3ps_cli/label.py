@@ -1,0 +1,184 @@
+"""``l3ps label``: the whole method in this process, no services."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from l3ps.costs import StageCost
+from l3ps.drivelog import opened, validate, without_bad_scans
+from l3ps.drivelog.types import Drive, Scene
+from l3ps.errors import DriveLogError, InputError, Problem
+from l3ps.evaluate import PanopticEvaluator, evaluate_scene
+from l3ps.labels import FORMATS, ScanLabels, write_poses, write_scene
+from l3ps.pipeline import primal_labels, refine_scene
+from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
+from l3ps.segment.bundle import ModelBundle
+from l3ps.segment.session import Segmenter
+from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
+from l3ps_cli.progress import bars
+from l3ps_cli.report import quality_table
+
+PARTS = ("primal", "refined", "poses.txt", "scans.txt")
+
+
+@dataclass
+class Run:
+    """What is gathered over the scenes of one run."""
+
+    scenes: list[dict[str, Any]] = field(default_factory=list)
+    poses: list[tuple[Scene, NDArray[np.float64]]] = field(default_factory=list)
+    quality: dict[str, PanopticEvaluator] = field(default_factory=dict)
+
+    def score(self, side: str, evaluator: PanopticEvaluator) -> None:
+        """Add one scene's counts to those of ``primal`` or ``refined``."""
+        if side in self.quality:
+            self.quality[side].merge(evaluator)
+        else:
+            self.quality[side] = evaluator
+
+
+def label(
+    log: Annotated[Path, typer.Argument(help="Drive log: a directory or archive of any supported format.")],
+    model: Annotated[Path, typer.Option(help="Model bundle: a directory or zip.")],
+    output: Annotated[Path, typer.Option("--out", help="Folder for the labels.")],
+    preset: Annotated[str, typer.Option(help=f"{', '.join(PRESETS)}.")] = DEFAULT_PRESET,
+    label_format: Annotated[str, typer.Option("--format", help=f"{', '.join(FORMATS)}.")] = "nuscenes",
+    report: Annotated[Path | None, typer.Option(help="Write costs and quality to this JSON file.")] = None,
+    scene: Annotated[str | None, typer.Option(help="Only this scene.")] = None,
+    skip_bad_scans: Annotated[bool, typer.Option("--skip-bad-scans", help="Label the good scans of a log.")] = False,
+    protocol: Annotated[str | None, typer.Option(help="nuscenes, paper or semantickitti.")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of each step.")] = 2,
+) -> None:
+    """Label every LiDAR point of a drive log; with truth in the log, score the labels too."""
+    with clear_errors():
+        parameters = _choose(PRESETS, preset, "--preset")
+        _choose(dict.fromkeys(FORMATS), label_format, "--format")
+        started = time.perf_counter()
+        segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
+        with opened(log) as whole, _all_or_nothing(output) as staging:
+            drive = _checked(_limited(whole, scene), skip_bad_scans)
+            run = Run()
+            for one in drive.scenes:
+                _label_scene(drive, one, segmenter, parameters, label_format, staging, run, protocol, threads)
+            write_poses(staging, run.poses)
+    summary = {
+        "log": log.name,
+        "format": drive.format,
+        "model": segmenter.bundle.info.name,
+        "preset": parameters.as_dict(),
+        "seconds": time.perf_counter() - started,
+        "scenes": run.scenes,
+        "quality": {side: evaluator.quality().as_dict() for side, evaluator in run.quality.items()},
+    }
+    if report is not None:
+        report.parent.mkdir(parents=True, exist_ok=True)
+        report.write_text(json.dumps(summary, indent=2) + "\n")
+    _show(summary, output)
+
+
+def _label_scene(
+    drive: Drive,
+    scene: Scene,
+    segmenter: Segmenter,
+    preset: Preset,
+    label_format: str,
+    target: Path,
+    run: Run,
+    protocol: str | None,
+    threads: int,
+) -> None:
+    with bars(f"{scene.name}  ") as progress:
+        began = time.perf_counter()
+        primal = primal_labels(scene, segmenter, progress)
+        segment_seconds = time.perf_counter() - began
+        refined = refine_scene(
+            scene, primal, preset, sensor_height=drive.sensor_height, threads=threads, progress=progress
+        )
+    sides: dict[str, Sequence[ScanLabels]] = {"primal": primal, "refined": refined.labels}
+    for side, labels in sides.items():
+        write_scene(target / side, label_format, scene, labels)
+        if any(scan.load_truth is not None for scan in scene.scans):
+            run.score(side, evaluate_scene(drive, scene, labels, protocol or drive.truth_space))
+    costs = {"segment": StageCost(seconds=segment_seconds)} | refined.costs
+    run.poses.append((scene, refined.poses))
+    run.scenes.append(
+        {
+            "name": scene.name,
+            "scans": len(scene.scans),
+            "points": sum(len(labels.semantic) for labels in primal),
+            "stages": {stage: asdict(cost) for stage, cost in costs.items()},
+        }
+    )
+
+
+def _limited(drive: Drive, scene: str | None) -> Drive:
+    if scene is None:
+        return drive
+    chosen = tuple(s for s in drive.scenes if s.name == scene)
+    if not chosen:
+        known = ", ".join(s.name for s in drive.scenes[:10])
+        raise DriveLogError(
+            Problem("unknown-scene", "--scene", f"the log has no scene '{scene}'", f"Its scenes are: {known}.")
+        )
+    return Drive(drive.root, drive.format, chosen, drive.truth_space, drive.sensor_height)
+
+
+def _checked(drive: Drive, skip_bad_scans: bool) -> Drive:
+    problems = validate(drive)
+    for problem in problems:
+        if problem.severity == "warning":
+            err.print(f"Warning: {problem}", style="yellow", markup=False, highlight=False)
+    bad = [problem for problem in problems if problem.severity != "warning"]
+    if bad and not (skip_bad_scans and all(problem.severity == "scan" for problem in bad)):
+        raise DriveLogError(bad)
+    for problem in bad:
+        err.print(f"Left out: {problem}", style="yellow", markup=False, highlight=False)
+    return without_bad_scans(drive, bad) if bad else drive
+
+
+@contextmanager
+def _all_or_nothing(target: Path) -> Iterator[Path]:
+    """A folder to write to that replaces the parts of ``target`` only when the block ends well."""
+    staging = target / ".partial"
+    try:
+        shutil.rmtree(staging, ignore_errors=True)
+        staging.mkdir(parents=True)
+    except OSError as error:
+        what = f"the folder cannot be made ({error.strerror})"
+        raise InputError(Problem("bad-output", str(target), what, "Name a folder that you may write to.")) from error
+    try:
+        yield staging
+        for part in PARTS:
+            old = target / part
+            if old.is_dir():
+                shutil.rmtree(old)
+            (staging / part).replace(old)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _choose(known: dict[str, Any], name: str, option: str) -> Any:
+    if name not in known:
+        fail(f"{option}: there is no '{name}'. Use one of {', '.join(known)}.", BAD_INPUT)
+    return known[name]
+
+
+def _show(summary: dict[str, Any], output: Path) -> None:
+    quality = summary["quality"]
+    if quality:
+        out.print(quality_table({"protocol": quality["refined"]["protocol"], **quality}))
+    points = sum(scene["points"] for scene in summary["scenes"])
+    scans = sum(scene["scans"] for scene in summary["scenes"])
+    out.print(f"{points:,} points of {scans} scans in {summary['seconds']:.1f} s", highlight=False)
+    out.print(f"Labels: {output}/refined (and {output}/primal), poses: {output}/poses.txt", highlight=False)

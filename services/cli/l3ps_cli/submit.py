@@ -1,0 +1,162 @@
+"""``l3ps submit``: a drive log and a model to a running service, and back a job."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from l3ps.errors import DriveLogError, Problem
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+from l3ps_cli.client import Client, ServiceProblemError, sentences
+from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
+from l3ps_cli.packing import ARCHIVE_SUFFIXES, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
+from l3ps_cli.watch import wait_for_job
+
+
+def submit(
+    log: Annotated[Path, typer.Argument(help="Drive log: a directory or an archive.")],
+    model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
+    preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
+    formats: Annotated[
+        list[str] | None, typer.Option("--format", help="Label format: nuscenes, semantickitti; may be repeated.")
+    ] = None,
+    protocol: Annotated[
+        str | None, typer.Option(help="Protocol of the quality figures: nuscenes, paper or semantickitti.")
+    ] = None,
+    skip_bad_scans: Annotated[
+        bool, typer.Option("--skip-bad-scans", help="Label the good scans of a log that has bad ones.")
+    ] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Stay until the job is over, showing its progress.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the job's document.")] = False,
+) -> None:
+    """Upload a drive log, start a job on it and, with --wait, see it through.
+
+    Exit codes: 0 done, 1 the job failed, 2 bad input, 3 the service cannot be reached.
+    """
+    with service_errors(), Client() as client:
+        model_name = ensure_model(client, model)
+        drive = upload_log(client, log)
+        job = create_job(client, drive["id"], model_name, preset, formats, protocol, skip_bad_scans)
+        if wait:
+            job = wait_for_job(client, job["id"], err)
+    if as_json:
+        out.print_json(data=job)
+    else:
+        out.print(f"job {job['id']}: {job['state']}", highlight=False)
+    if wait and job["state"] != "succeeded":
+        fail("\n".join(job_failure(job)), BAD_INPUT if job["drive"]["state"] == "rejected" else JOB_FAILED)
+
+
+def create_job(
+    client: Client,
+    drive_id: str,
+    model: str,
+    preset: str,
+    formats: list[str] | None = None,
+    protocol: str | None = None,
+    skip_bad_scans: bool = False,
+) -> dict[str, Any]:
+    """Start a job; what is None is left to the service."""
+    request: dict[str, Any] = {
+        "drive_id": drive_id,
+        "model": model,
+        "preset": preset,
+        "skip_bad_scans": skip_bad_scans,
+    }
+    if formats:
+        request["formats"] = formats
+    if protocol:
+        request["protocol"] = protocol
+    return client.post("/jobs", request)
+
+
+def job_failure(job: dict[str, Any]) -> list[str]:
+    """Why a job did not succeed, as sentences."""
+    if job["state"] == "cancelled":
+        return [f"Job {job['id']} was cancelled."]
+    return sentences({"detail": f"Job {job['id']} failed. {job.get('message') or ''}", "errors": job.get("errors")})
+
+
+def ensure_model(client: Client, model: str) -> str:
+    """The name of a model that the service has; a bundle given by path is uploaded unless it is there already."""
+    path = Path(model)
+    if not (path.is_dir() or path.is_file()):
+        return model
+    name = bundle_name(path)
+    with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
+        archive = path
+        if path.is_dir():
+            archive = Path(scratch) / f"{name}.zip"
+            pack_bundle(path, archive)
+        sha256 = sha256_of(archive)
+        try:
+            known = client.get(f"/models/{name}")
+        except ServiceProblemError as error:
+            if error.status != 404:
+                raise
+        else:
+            if known["sha256"] == sha256 and known["state"] != "rejected":
+                return name
+        with _bytes_bar("uploading the model", archive.stat().st_size) as advance:
+            client.upload(archive, "model", sha256, name, advance)
+    return name
+
+
+def upload_log(client: Client, log: Path) -> dict[str, Any]:
+    """The drive document of a log, uploaded unless the service already has one of the same bytes.
+
+    Raises DriveLogError when ``log`` is neither a directory nor an archive the service takes.
+    """
+    if log.is_dir():
+        with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
+            archive = Path(scratch) / f"{log.resolve().name}.tar"
+            with _bytes_bar("packing", 0) as advance:
+                pack_log(log, archive, _since(advance))
+            return _upload_archive(client, archive, log.resolve().name)
+    if not log.is_file():
+        what, remedy = "there is no such file or directory", "Name a drive log."
+        raise DriveLogError(Problem("no-log", str(log), what, remedy))
+    if not is_archive_name(log):
+        what = "it is no archive by its name"
+        raise DriveLogError(Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."))
+    name = log.name
+    for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
+        name = name.removesuffix(suffix)
+    return _upload_archive(client, log, name)
+
+
+def _upload_archive(client: Client, archive: Path, name: str) -> dict[str, Any]:
+    size = archive.stat().st_size
+    with _bytes_bar("checksum", size) as advance:
+        sha256 = sha256_of(archive, _since(advance))
+    for drive in client.get("/drives", sha256=sha256)["items"]:
+        if drive["state"] != "rejected":
+            err.print(f"the service has this log already: {drive['id']}", highlight=False)
+            return dict(drive)
+    with _bytes_bar("uploading", size) as advance:
+        return client.upload(archive, "drive", sha256, name, advance)
+
+
+@contextmanager
+def _bytes_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(*columns, console=err) as progress:
+        bar = progress.add_task(what, total=total or None)
+        yield lambda count: progress.advance(bar, count)
+
+
+def _since(advance: Callable[[int], None]) -> Callable[[int, int], None]:
+    """A (done, total) report that advances a bar by what is new."""
+    last = 0
+
+    def report(done: int, _total: int) -> None:
+        nonlocal last
+        advance(done - last)
+        last = done
+
+    return report

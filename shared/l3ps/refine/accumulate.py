@@ -1,0 +1,74 @@
+"""Scans of a scene into one frame: KISS-ICP poses (paper, section III-D, step 1).
+
+KISS-ICP filters the frame it returns, so only its pose is taken and the raw points keep their order. One estimator
+serves one scene: carried over, it would register the next scene against a map of another place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
+from kiss_icp.kiss_icp import KissICP
+from numpy.typing import NDArray
+
+from l3ps.errors import ProcessingError
+from l3ps.presets import Odometry
+
+NO_TIMES = np.empty(0)
+"""KISS-ICP reads an empty array as "do not deskew"; anything of another length than the scan fails."""
+
+
+def estimate_poses(scans: Iterable[NDArray[np.float32]], odometry: Odometry, threads: int = 2) -> NDArray[np.float64]:
+    """Pose of each scan in the frame of the first.
+
+    Args:
+        scans: per scan (N, 3) float32, metres, lidar frame, in time order; rows that are not finite are left out.
+        odometry: KISS-ICP's constants.
+        threads: threads of the registration; KISS-ICP fixes them once a process, the first call decides.
+
+    Returns:
+        (S, 4, 4) float64 lidar → scene.
+
+    Raises:
+        ProcessingError: when a scan has no point in range or a pose is not finite.
+    """
+    estimator = KissICP(_config(odometry, threads))
+    poses: list[NDArray[np.float64]] = []
+    for index, xyz in enumerate(scans):
+        reach = np.linalg.norm(xyz, axis=1)
+        usable = xyz[np.isfinite(reach) & (reach < odometry.max_range) & (reach > odometry.min_range)]
+        if len(usable) == 0:
+            raise ProcessingError(
+                f"scan {index} has no point between {odometry.min_range:g} m and {odometry.max_range:g} m: "
+                "it cannot be registered; leave the scan out or check its units."
+            )
+        estimator.register_frame(usable.astype(np.float64), NO_TIMES)
+        if not np.isfinite(estimator.last_pose).all():
+            raise ProcessingError(f"odometry diverged at scan {index}: its pose is not finite.")
+        poses.append(estimator.last_pose.copy())
+    return np.stack(poses) if poses else np.empty((0, 4, 4))
+
+
+def transform(xyz: NDArray[np.float32], pose: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points (N, 3) float32 of the lidar frame in the frame that ``pose`` (4, 4) leads to.
+
+    Computed in float64 and rounded once.
+    """
+    return (xyz.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+
+
+def _config(odometry: Odometry, threads: int) -> KISSConfig:
+    # model_construct: the normal constructor reads environment variables with the prefix kiss_icp_, and a stray one
+    # would change the labels.
+    return KISSConfig.model_construct(
+        out_dir="",
+        data=DataConfig(max_range=odometry.max_range, min_range=odometry.min_range, deskew=False),
+        mapping=MappingConfig(voxel_size=odometry.voxel_size, max_points_per_voxel=odometry.max_points_per_voxel),
+        registration=RegistrationConfig(max_num_threads=threads),
+        adaptive_threshold=AdaptiveThresholdConfig(
+            initial_threshold=odometry.initial_threshold, min_motion_th=odometry.min_motion
+        ),
+    )

@@ -1,0 +1,104 @@
+"""Geometric clusters of the accumulated scene: HDBSCAN per partition (paper, section III-D, step 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import hdbscan
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+NOISE = -1
+NOISE_NEIGHBOURS = 3
+"""Noise points take the majority cluster of their 3 nearest clustered points (published)."""
+
+Clusterer = Callable[[NDArray[np.float32], int, int], NDArray[np.int32]]
+"""(points (N, 3), min_cluster_size, threads) → (N,) int32 label, -1 for noise."""
+
+
+def hdbscan_package(points: NDArray[np.float32], min_cluster_size: int, threads: int) -> NDArray[np.int32]:
+    """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass."""
+    if len(points) <= min_cluster_size:
+        return np.full(len(points), NOISE, dtype=np.int32)
+    model = hdbscan.HDBSCAN(min_cluster_size=min_cluster_size, core_dist_n_jobs=threads)
+    return np.asarray(model.fit_predict(points), dtype=np.int32)
+
+
+def cluster_scene(
+    points: NDArray[np.float32],
+    ground: NDArray[np.bool_],
+    min_cluster_size: int,
+    *,
+    threads: int = 2,
+    voxel: float | None = None,
+    clusterer: Clusterer = hdbscan_package,
+) -> NDArray[np.int32]:
+    """Cluster ground and non-ground points apart from each other.
+
+    Args:
+        points: (N, 3) float32, metres, scene frame.
+        ground: (N,) bool partition.
+        min_cluster_size: HDBSCAN's s.
+        threads: threads of the clusterer.
+        voxel: edge in metres of the cells whose centroids are clustered in place of the points; None clusters the
+            points themselves, as published.
+        clusterer: the implementation.
+
+    Returns:
+        (N,) int32 cluster ids from 0, unique over both partitions. A partition in which no cluster was found keeps
+        -1: nothing groups its points.
+    """
+    labels = np.full(len(points), NOISE, dtype=np.int32)
+    first_free = 0
+    for partition in (~ground, ground):
+        members = np.flatnonzero(partition)
+        if len(members) == 0:
+            continue
+        own = points[members]
+        seeds, cell = (own, None) if voxel is None else _centroids(own, voxel)
+        found = reassign_noise(seeds, clusterer(seeds, min_cluster_size, threads), threads)
+        found = found if cell is None else found[cell]
+        labels[members] = np.where(found == NOISE, NOISE, found + first_free)
+        first_free += int(found.max()) + 1
+    return labels
+
+
+def reassign_noise(points: NDArray[np.float32], labels: NDArray[np.int32], threads: int = 2) -> NDArray[np.int32]:
+    """Give each noise point the majority cluster of its nearest clustered points; a tie goes to the lowest id.
+
+    Args:
+        points: (N, 3) float32, metres.
+        labels: (N,) int32 cluster, -1 for noise.
+        threads: threads of the neighbour search.
+
+    Returns:
+        (N,) int32 without noise, unless there is no cluster at all.
+    """
+    noise = labels == NOISE
+    if not noise.any() or noise.all():
+        return labels
+    clustered = np.flatnonzero(~noise)
+    k = min(NOISE_NEIGHBOURS, len(clustered))
+    _, neighbour = cKDTree(points[clustered]).query(points[noise], k=k, workers=threads)
+    votes = np.sort(labels[clustered][neighbour.reshape(-1, k)], axis=1)
+    out = labels.copy()
+    out[noise] = _row_mode(votes)
+    return out
+
+
+def _row_mode(rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Most frequent value of each sorted row; a tie goes to the lowest."""
+    count = (rows[:, :, None] == rows[:, None, :]).sum(axis=2)
+    return np.asarray(rows[np.arange(len(rows)), count.argmax(axis=1)], dtype=np.int32)
+
+
+def _centroids(points: NDArray[np.float32], voxel: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Centroid of each occupied cell, and each point's cell."""
+    key = np.floor(points / voxel).astype(np.int64)
+    key -= key.min(axis=0)
+    extent = key.max(axis=0) + 1
+    flat = (key[:, 0] * extent[1] + key[:, 1]) * extent[2] + key[:, 2]
+    _, cell, count = np.unique(flat, return_inverse=True, return_counts=True)
+    total = np.stack([np.bincount(cell, weights=points[:, axis]) for axis in range(3)], axis=1)
+    return (total / count[:, None]).astype(np.float32), cell

@@ -1,0 +1,58 @@
+"""The catalog: what there is and what is being done with it.
+
+Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
+``bundles`` (models), ``jobs``, ``stages``. What changes states is in :mod:`l3ps_platform.workflow`.
+"""
+
+from l3ps_platform.catalog import bundles, drives, jobs, stages, uploads
+from l3ps_platform.catalog.models import (
+    Base,
+    DriveRow,
+    JobRow,
+    Json,
+    ModelRow,
+    SceneRow,
+    StageRow,
+    StepRow,
+    UploadRow,
+)
+from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
+from l3ps_platform.catalog.states import (
+    QUEUE_OF,
+    DriveState,
+    JobState,
+    ModelState,
+    QueueName,
+    StageName,
+    StageState,
+    UploadState,
+)
+
+__all__ = [
+    "QUEUE_OF",
+    "Base",
+    "Catalog",
+    "DriveRow",
+    "DriveState",
+    "JobRow",
+    "JobState",
+    "Json",
+    "ModelRow",
+    "ModelState",
+    "QueueName",
+    "SceneRow",
+    "Sender",
+    "StageMessage",
+    "StageName",
+    "StageRow",
+    "StageState",
+    "StepRow",
+    "Transaction",
+    "UploadRow",
+    "UploadState",
+    "bundles",
+    "drives",
+    "jobs",
+    "stages",
+    "uploads",
+]

@@ -1,0 +1,57 @@
+"""Queries for jobs and their scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from l3ps_platform.catalog.models import JobRow, SceneRow
+from l3ps_platform.catalog.states import JobState
+from l3ps_platform.errors import NotFound
+
+
+def get(session: Session, id: str) -> JobRow:
+    """One job. NotFound."""
+    row = session.get(JobRow, id)
+    if row is None:
+        raise NotFound("job", id)
+    return row
+
+
+def lock(session: Session, id: str) -> JobRow:
+    """One job, held against concurrent changes until the transaction ends. NotFound."""
+    query = select(JobRow).where(JobRow.id == id).with_for_update()
+    row = session.scalars(query, execution_options={"populate_existing": True}).one_or_none()
+    if row is None:
+        raise NotFound("job", id)
+    return row
+
+
+def page(
+    session: Session, *, limit: int = 50, before: str | None = None, state: JobState | None = None
+) -> list[JobRow]:
+    """Jobs, newest first, after the cursor ``before`` (the last id of the page before)."""
+    query = select(JobRow)
+    if before is not None:
+        query = query.where(JobRow.id < before)
+    if state is not None:
+        query = query.where(JobRow.state == state)
+    return list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit)))
+
+
+def scenes(session: Session, job_id: str) -> list[SceneRow]:
+    """A job's scenes in the log's order."""
+    return list(session.scalars(select(SceneRow).where(SceneRow.job_id == job_id).order_by(SceneRow.position)))
+
+
+def unplanned(session: Session, *, drive_id: str | None = None, model_id: str | None = None) -> Sequence[JobRow]:
+    """Queued jobs of a drive or model that have no scenes yet, because the drive or model is still being checked."""
+    query = select(JobRow).where(JobRow.state == JobState.QUEUED, JobRow.cancel_requested.is_(False))
+    query = query.where(JobRow.id.not_in(select(SceneRow.job_id)))
+    if drive_id is not None:
+        query = query.where(JobRow.drive_id == drive_id)
+    if model_id is not None:
+        query = query.where(JobRow.model_id == model_id)
+    return list(session.scalars(query.order_by(JobRow.id).with_for_update()))

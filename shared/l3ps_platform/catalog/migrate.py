@@ -1,0 +1,49 @@
+"""Bring a catalog to the current schema: at the API's start when embedded, by a step of its own elsewhere.
+
+Run as ``python -m l3ps_platform.catalog.migrate`` with the service's settings.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, text
+
+from l3ps_platform.catalog.session import make_engine
+from l3ps_platform.settings import get_settings
+
+_LOCK = 7_335_401  # any constant: API replicas that start together migrate one after the other
+
+
+def upgrade(url: str) -> None:
+    """Create or migrate the catalog at ``url``; does nothing when it is current. Safe to run concurrently."""
+    engine = make_engine(url)
+    try:
+        with engine.begin() as connection:
+            if connection.dialect.name == "postgresql":
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+            if not is_current(connection):
+                command.upgrade(_config(connection), "head")
+    finally:
+        engine.dispose()
+
+
+def is_current(connection: Connection) -> bool:
+    """Whether the schema is the one this code expects."""
+    head = ScriptDirectory.from_config(_config(connection)).get_current_head()
+    return MigrationContext.configure(connection).get_current_revision() == head
+
+
+def _config(connection: Connection) -> Config:
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.attributes["connection"] = connection
+    return config
+
+
+if __name__ == "__main__":
+    upgrade(get_settings().catalog_url)

@@ -1,0 +1,243 @@
+"""The tables. The catalog is the truth about jobs; the queue only carries (stage id, attempt)."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    DateTime,
+    Dialect,
+    Enum,
+    ForeignKey,
+    Index,
+    MetaData,
+    String,
+    TypeDecorator,
+    UniqueConstraint,
+)
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from l3ps_platform.catalog.states import (
+    DriveState,
+    JobState,
+    ModelState,
+    QueueName,
+    StageName,
+    StageState,
+    UploadState,
+)
+
+Json = dict[str, Any]
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An aware UTC date on both databases (SQLite drops the zone)."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Store in UTC."""
+        return None if value is None else value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Return with its zone."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+def _states(kind: type[StrEnum]) -> Enum:
+    # Plain text with a CHECK: a native PostgreSQL enum cannot lose a value and SQLite has none.
+    return Enum(
+        kind,
+        native_enum=False,
+        length=16,
+        create_constraint=True,
+        name=kind.__name__.lower(),
+        values_callable=lambda members: [member.value for member in members],
+    )
+
+
+class Base(DeclarativeBase):
+    """Base of every table."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map = {  # noqa: RUF012
+        Json: JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql"),
+        datetime: UtcDateTime(),
+        int: BigInteger(),
+        UploadState: _states(UploadState),
+        DriveState: _states(DriveState),
+        ModelState: _states(ModelState),
+        JobState: _states(JobState),
+        StageState: _states(StageState),
+        StageName: _states(StageName),
+        QueueName: _states(QueueName),
+    }
+
+
+class UploadRow(Base):
+    """A multipart upload in progress, or its memory."""
+
+    __tablename__ = "uploads"
+    __table_args__ = (Index(None, "state", "expires_at"),)
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    kind: Mapped[str] = mapped_column(String(16))  # drive | model
+    filename: Mapped[str]
+    size: Mapped[int]
+    sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
+    parts: Mapped[int]
+    state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
+    object_key: Mapped[str]
+    s3_upload_id: Mapped[str]
+    result_id: Mapped[str | None] = mapped_column(String(32))  # the drive or model it became
+    created_at: Mapped[datetime]
+    expires_at: Mapped[datetime]
+
+
+class DriveRow(Base):
+    """A drive log.
+
+    ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
+    ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
+    counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
+    archive file's: the client's claim until the ingest stage has compared it.
+    """
+
+    __tablename__ = "drives"
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    name: Mapped[str]
+    filename: Mapped[str]
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    size: Mapped[int]
+    format: Mapped[str | None] = mapped_column(String(32))
+    state: Mapped[DriveState] = mapped_column(default=DriveState.UPLOADED)
+    problem: Mapped[Json | None]
+    info: Mapped[Json | None]
+    object_key: Mapped[str | None]
+    created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
+
+
+class ModelRow(Base):
+    """A model bundle; ``info`` once ready: ``{"label_space", "classes", "input": [height, width], "has_boundary"}``."""
+
+    __tablename__ = "models"
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    name: Mapped[str] = mapped_column(String(200), unique=True)
+    filename: Mapped[str]
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    size: Mapped[int]
+    state: Mapped[ModelState] = mapped_column(default=ModelState.UPLOADED)
+    problem: Mapped[Json | None]
+    info: Mapped[Json | None]
+    object_key: Mapped[str | None]
+    created_at: Mapped[datetime]
+
+
+class JobRow(Base):
+    """One labelling of one drive with one model.
+
+    ``settings``: ``{"preset", "formats": […], "protocol", "skip_bad_scans"}``.
+    ``error``: ``{"message", "problems": […]}``. ``quality``: ``{"protocol", "primal": {…}, "refined": {…}}`` with
+    ``Quality.as_dict()`` of each, or None where the log has no truth.
+    """
+
+    __tablename__ = "jobs"
+    __table_args__ = (Index(None, "state"), Index(None, "drive_id"))
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    drive_id: Mapped[str] = mapped_column(ForeignKey("drives.id"))
+    model_id: Mapped[str] = mapped_column(ForeignKey("models.id"))
+    settings: Mapped[Json]
+    state: Mapped[JobState] = mapped_column(default=JobState.QUEUED)
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    error: Mapped[Json | None]
+    quality: Mapped[Json | None]
+    created_at: Mapped[datetime]
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+
+
+class SceneRow(Base):
+    """One scene of a job. ``quality``: ``{"protocol", "primal", "refined"}`` with the evaluators' states."""
+
+    __tablename__ = "scenes"
+    __table_args__ = (UniqueConstraint("job_id", "position"),)
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"))
+    name: Mapped[str]
+    position: Mapped[int]
+    scans: Mapped[int]
+    points: Mapped[int]
+    state: Mapped[StageState] = mapped_column(default=StageState.QUEUED)
+    quality: Mapped[Json | None]
+
+
+class StageRow(Base):
+    """One unit of work a worker can own.
+
+    An ingest stage has a drive or a model, a publish stage a job, segment and refine stages a scene and its job.
+    ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
+    count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
+    """
+
+    __tablename__ = "stages"
+    __table_args__ = (Index(None, "state", "lease_until"), Index(None, "job_id"), Index(None, "scene_id"))
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    scene_id: Mapped[str | None] = mapped_column(ForeignKey("scenes.id", ondelete="CASCADE"))
+    job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"))
+    drive_id: Mapped[str | None] = mapped_column(ForeignKey("drives.id"))
+    model_id: Mapped[str | None] = mapped_column(ForeignKey("models.id"))
+    name: Mapped[StageName]
+    queue: Mapped[QueueName]
+    state: Mapped[StageState] = mapped_column(default=StageState.WAITING)
+    attempt: Mapped[int] = mapped_column(default=1)
+    not_before: Mapped[datetime | None]
+    lease_owner: Mapped[str | None]
+    lease_until: Mapped[datetime | None]
+    progress_step: Mapped[str | None] = mapped_column(String(32))
+    progress_done: Mapped[int] = mapped_column(default=0)
+    progress_total: Mapped[int] = mapped_column(default=0)
+    fraction: Mapped[float] = mapped_column(default=0.0)
+    seconds: Mapped[float | None]
+    cpu_seconds: Mapped[float | None]
+    peak_mb: Mapped[float | None]
+    scans: Mapped[int | None]
+    points: Mapped[int | None]
+    cached: Mapped[bool] = mapped_column(default=False)
+    output_key: Mapped[str | None]
+    error: Mapped[Json | None]
+    queued_at: Mapped[datetime | None]
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+
+
+class StepRow(Base):
+    """What a step inside a stage cost (``accumulate``, ``cluster`` …), for the metrics and the job's page."""
+
+    __tablename__ = "steps"
+
+    stage_id: Mapped[str] = mapped_column(ForeignKey("stages.id", ondelete="CASCADE"), primary_key=True)
+    name: Mapped[str] = mapped_column(String(32), primary_key=True)
+    seconds: Mapped[float]
+    peak_mb: Mapped[float]

@@ -1,0 +1,150 @@
+"""Transactions: SQLite in WAL or PostgreSQL, with messages that leave only after the commit."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import structlog
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.orm import Session
+
+from l3ps_platform.catalog.states import QueueName, StageName
+from l3ps_platform.errors import CatalogUnavailable
+
+log = structlog.get_logger(__name__)
+
+# SQLite allows one writer at a time; ours hold the lock for milliseconds, so half a minute is never a real wait.
+SQLITE_BUSY_MS = 30_000
+
+
+@dataclass(frozen=True, slots=True)
+class StageMessage:
+    """All that travels through the queue, and where to."""
+
+    stage_id: str
+    attempt: int
+    name: StageName
+    queue: QueueName
+
+
+Sender = Callable[[Sequence[StageMessage]], None]
+
+
+@dataclass(slots=True)
+class Transaction:
+    """A writing transaction: its session, its clock, and the messages to send once it is committed.
+
+    Attributes:
+        session: the SQLAlchemy session.
+        now: one time for everything the transaction writes, by the database server's clock, so that workers
+            whose clocks disagree still agree on leases.
+        outbox: messages to send after the commit.
+    """
+
+    session: Session
+    now: datetime
+    outbox: list[StageMessage] = field(default_factory=list)
+
+
+class Catalog:
+    """The database. Cheap to make; connects on first use; make one per process (after a fork).
+
+    Args:
+        url: SQLAlchemy URL, ``sqlite:///PATH`` or ``postgresql+psycopg://…``.
+        sender: called with the messages of a transaction after its commit; None drops them, which is right for
+            processes that enqueue nothing and for tests (the reconciler finds lost messages).
+    """
+
+    def __init__(self, url: str, sender: Sender | None = None) -> None:
+        self.url = url
+        self._sender = sender
+        self.engine = make_engine(url)
+
+    @contextmanager
+    def transaction(self) -> Iterator[Transaction]:
+        """A writing transaction; commits on leaving, rolls back on any exception, then sends the messages.
+
+        A message that cannot be sent is logged and left to the reconciler: the row says ``queued`` and is the truth.
+        """
+        with self._session(write=True) as session:
+            transaction = Transaction(session, self.now(session))
+            yield transaction
+            session.commit()
+        self._flush(transaction.outbox)
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """A session for queries; whatever it changes is rolled back."""
+        with self._session(write=False) as session:
+            yield session
+
+    def ping(self) -> None:
+        """Raise CatalogUnavailable unless the database answers."""
+        with self.reading() as session:
+            session.execute(text("SELECT 1"))
+
+    def dispose(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+
+    @contextmanager
+    def _session(self, *, write: bool) -> Iterator[Session]:
+        with Session(self.engine, expire_on_commit=False) as session:
+            try:
+                session.connection(execution_options={"l3ps_write": write})
+                yield session
+            except (OperationalError, InterfaceError) as error:
+                raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+
+    def now(self, session: Session) -> datetime:
+        """The database server's time."""
+        if self.engine.dialect.name == "sqlite":
+            return datetime.now(UTC)  # the database is on this machine
+        moment: datetime = session.execute(text("SELECT clock_timestamp()")).scalar_one()
+        return moment.astimezone(UTC)
+
+    def _flush(self, messages: Sequence[StageMessage]) -> None:
+        if not messages or self._sender is None:
+            return
+        try:
+            self._sender(messages)
+        except Exception:
+            log.warning("messages not sent, the reconciler will", stages=[m.stage_id for m in messages], exc_info=True)
+
+
+def make_engine(url: str) -> Engine:
+    """An engine with the settings each database needs."""
+    parsed = make_url(url)
+    if parsed.get_backend_name() == "sqlite":
+        if parsed.database:
+            Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+        engine = create_engine(url, connect_args={"timeout": SQLITE_BUSY_MS / 1000})
+        event.listen(engine, "connect", _on_sqlite_connect)
+        event.listen(engine, "begin", _on_sqlite_begin)
+        return engine
+    # A pooled connection that died with the server is replaced before use instead of failing the first request.
+    return create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args={"connect_timeout": 5})
+
+
+def _on_sqlite_connect(connection: sqlite3.Connection, _record: Any) -> None:
+    # The driver's own BEGIN is deferred: two readers that both go on to write then fail at once, whatever the
+    # busy timeout. We say BEGIN IMMEDIATE ourselves.
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    cursor.execute(f"PRAGMA busy_timeout={SQLITE_BUSY_MS}")
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=NORMAL")  # safe in WAL against a crash of the process; fewer syncs
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()
+
+
+def _on_sqlite_begin(connection: Connection) -> None:
+    write = connection.get_execution_options().get("l3ps_write", True)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")

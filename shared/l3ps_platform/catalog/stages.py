@@ -1,0 +1,54 @@
+"""Queries for stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from sqlalchemy import case, func, select
+from sqlalchemy.orm import Session
+
+from l3ps_platform.catalog.models import StageRow, StepRow
+from l3ps_platform.catalog.states import StageName, StageState
+from l3ps_platform.errors import NotFound
+
+
+def get(session: Session, id: str) -> StageRow:
+    """One stage. NotFound."""
+    row = session.get(StageRow, id)
+    if row is None:
+        raise NotFound("stage", id)
+    return row
+
+
+def of_job(session: Session, job_id: str) -> list[StageRow]:
+    """All stages of a job, its scenes' and its own, in the order they were planned."""
+    return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
+
+
+def of_scene(session: Session, scene_id: str) -> list[StageRow]:
+    """The stages of one scene, in order."""
+    return list(session.scalars(select(StageRow).where(StageRow.scene_id == scene_id).order_by(StageRow.id)))
+
+
+def progress(session: Session, job_ids: Iterable[str]) -> dict[str, tuple[float, int]]:
+    """For each job how much of its stages is done, the running ones by their fraction, and how many there are."""
+    final = StageRow.state.in_([state for state in StageState if state.final])
+    share = case((final, 1.0), (StageRow.state == StageState.RUNNING, StageRow.fraction), else_=0.0)
+    query = select(StageRow.job_id, func.sum(share), func.count()).where(StageRow.job_id.in_(set(job_ids)))
+    rows = session.execute(query.group_by(StageRow.job_id)).tuples()
+    return {job_id: (float(done), count) for job_id, done, count in rows if job_id is not None}
+
+
+def ingest_of(session: Session, *, drive_id: str | None = None, model_id: str | None = None) -> StageRow | None:
+    """The stage that checks a drive or model."""
+    query = select(StageRow).where(StageRow.name == StageName.INGEST)
+    query = query.where(StageRow.drive_id == drive_id, StageRow.model_id == model_id)
+    return session.scalars(query.order_by(StageRow.id.desc()).limit(1)).one_or_none()
+
+
+def steps(session: Session, stage_ids: Sequence[str]) -> dict[str, list[StepRow]]:
+    """What the steps inside each stage cost."""
+    found: dict[str, list[StepRow]] = {id: [] for id in stage_ids}
+    for row in session.scalars(select(StepRow).where(StepRow.stage_id.in_(stage_ids))):
+        found[row.stage_id].append(row)
+    return found

@@ -1,0 +1,22 @@
+"""The object store: one interface, two stores, chosen by a URL."""
+
+from l3ps_platform.objects.directory import DirectoryStore, Incoming
+from l3ps_platform.objects.interface import ObjectInfo, ObjectStore, Part
+from l3ps_platform.objects.keys import check_key, content_type, segment
+from l3ps_platform.objects.signing import OBJECTS_PATH, Grant, Signer
+from l3ps_platform.objects.stores import open_store
+
+__all__ = [
+    "OBJECTS_PATH",
+    "DirectoryStore",
+    "Grant",
+    "Incoming",
+    "ObjectInfo",
+    "ObjectStore",
+    "Part",
+    "Signer",
+    "check_key",
+    "content_type",
+    "open_store",
+    "segment",
+]

@@ -1,0 +1,90 @@
+"""The port to the object store: what the product needs of S3 and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectInfo:
+    """One object as the store sees it; ``etag`` without quotes."""
+
+    key: str
+    size: int
+    etag: str
+    modified: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One uploaded part of a multipart upload, as the client reports it (quotes around the etag do not matter)."""
+
+    number: int
+    etag: str
+
+
+class ObjectStore(Protocol):
+    """Named bytes. Writes are atomic: a reader sees the old object, the new one or none.
+
+    Every method may raise StoreUnavailable; every key is checked (InvalidKey). The content type follows from the
+    key's suffix.
+    """
+
+    def ensure(self) -> None:
+        """Create the bucket or directory if it is missing."""
+
+    def ping(self) -> None:
+        """Raise StoreUnavailable unless the store answers."""
+
+    def put_file(self, key: str, path: Path) -> None:
+        """Store a file."""
+
+    def put_bytes(self, key: str, data: bytes) -> None:
+        """Store bytes."""
+
+    def get_file(self, key: str, path: Path) -> None:
+        """Fetch an object into a file; ``path`` appears complete or not at all. ObjectMissing."""
+
+    def get_bytes(self, key: str, offset: int = 0, length: int | None = None) -> bytes:
+        """The object's bytes from ``offset`` on, at most ``length`` of them. ObjectMissing."""
+
+    def open(self, key: str) -> AbstractContextManager[BinaryIO]:
+        """A stream for reading once, front to back. ObjectMissing."""
+
+    def stat(self, key: str) -> ObjectInfo:
+        """Size, etag and age. ObjectMissing."""
+
+    def exists(self, key: str) -> bool:
+        """Whether there is such an object."""
+
+    def list(self, prefix: str = "") -> Iterator[ObjectInfo]:
+        """All objects below ``prefix`` (empty, or ending with a slash), in the order of their keys."""
+
+    def delete(self, key: str) -> None:
+        """Delete an object; nothing happens if there is none."""
+
+    def delete_prefix(self, prefix: str) -> int:
+        """Delete all objects below ``prefix``; returns how many."""
+
+    def presign_get(self, key: str, seconds: int, filename: str | None = None) -> str:
+        """A URL that downloads the object without credentials; ``filename`` is what the browser saves it as."""
+
+    def presign_put(self, key: str, seconds: int) -> str:
+        """A URL that stores the body of one PUT."""
+
+    def create_multipart(self, key: str) -> str:
+        """Begin a multipart upload; returns its id."""
+
+    def presign_part(self, key: str, upload_id: str, number: int, seconds: int) -> str:
+        """A URL that stores the body of one PUT as part ``number`` (from 1); the reply's ETag names it."""
+
+    def complete_multipart(self, key: str, upload_id: str, parts: Sequence[Part]) -> ObjectInfo:
+        """Join the parts in the order of their numbers into one object. UploadError when they do not fit."""
+
+    def abort_multipart(self, key: str, upload_id: str) -> None:
+        """Drop an upload and its parts; nothing happens if there is none."""

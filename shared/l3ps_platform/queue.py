@@ -1,0 +1,142 @@
+"""The queue: Celery on Redis, used as a doorbell.
+
+A message is ``(stage id, attempt)``. It says "look at this row"; whether there is something to do, and for whom, the
+catalog decides. So the queue may lose, delay and repeat messages, and no result is kept in it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, cast
+
+import redis
+from celery import Celery
+from celery.exceptions import OperationalError as CeleryOperationalError
+from kombu.entity import Queue as KombuQueue
+from kombu.exceptions import OperationalError as KombuOperationalError
+
+from l3ps_platform.catalog.session import StageMessage
+from l3ps_platform.catalog.states import QueueName, StageName
+from l3ps_platform.errors import QueueUnavailable
+from l3ps_platform.settings import Settings
+
+TASK_NAMES = {name: f"l3ps.{name.value}" for name in StageName}
+"""Which Celery task does which stage."""
+
+# Redelivery is no part of our recovery (leases are), so messages of long stages must not come back while they run:
+# a task of 14 s under a visibility timeout of 5 s was started three times.
+_VISIBILITY_SECONDS = 24 * 3600
+
+
+def make_app(settings: Settings) -> Celery:
+    """The Celery application of workers and clients alike."""
+    app = Celery("l3ps", broker=settings.broker_url)
+    transport = {
+        # The shortest of the three places wins, so all three get the same.
+        "visibility_timeout": _VISIBILITY_SECONDS,
+        # At kombu's defaults the unacknowledged messages of a killed worker were looked at after 100 s.
+        "unacked_restore_interval": 1,
+        "unacked_restore_throttle": 1,
+        "socket_connect_timeout": 2,
+        "socket_keepalive": True,
+        "health_check_interval": 25,
+    }
+    app.conf.update(
+        broker_transport_options=transport,
+        result_backend=None,
+        result_backend_transport_options={"visibility_timeout": _VISIBILITY_SECONDS},
+        visibility_timeout=_VISIBILITY_SECONDS,
+        broker_connection_retry_on_startup=True,
+        broker_connection_max_retries=None,  # a worker waits for Redis however long it takes
+        task_queues=[KombuQueue(name.value) for name in QueueName],  # type: ignore[no-untyped-call]
+        task_default_queue=QueueName.REFINE.value,
+        task_create_missing_queues=False,
+        task_serializer="json",
+        accept_content=["json"],
+        task_ignore_result=True,
+        task_store_errors_even_if_ignored=False,
+        # A message is acknowledged when its stage's row is written. If the process dies before that, acks_late alone
+        # acknowledges it as failed, and that is wanted: the lease runs out, the reconciler counts the attempt and
+        # sends a new message. Requeueing here instead (reject_on_worker_lost) loops for ever on a stage that is
+        # killed for memory.
+        task_acks_late=True,
+        task_reject_on_worker_lost=False,
+        task_acks_on_failure_or_timeout=True,
+        # One stage in hand, none in reserve: a reserved one would wait behind a long one while other workers idle,
+        # and the prefetch counter drifts with acks_late.
+        worker_prefetch_multiplier=1,
+        worker_disable_prefetch=True,
+        worker_cancel_long_running_tasks_on_connection_loss=False,  # the lease, not the connection, is ownership
+        task_time_limit=settings.stage_seconds,
+        worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
+        worker_send_task_events=False,
+        worker_enable_remote_control=True,
+        task_publish_retry_policy={"max_retries": 1, "interval_start": 0, "interval_step": 0.2, "interval_max": 0.2},
+    )
+    return app
+
+
+class Queue:
+    """Sending side and gauges of the queue."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._app = make_app(settings)
+        self._redis: redis.Redis = redis.Redis.from_url(
+            settings.redis_url, socket_connect_timeout=2, socket_timeout=5, health_check_interval=25
+        )
+
+    def send(self, messages: Sequence[StageMessage]) -> None:
+        """Send messages. QueueUnavailable when Redis does not take them."""
+        try:
+            with self._app.producer_pool.acquire(block=True, timeout=5) as producer:
+                for message in messages:
+                    self._app.send_task(
+                        TASK_NAMES[message.name],
+                        args=(message.stage_id, message.attempt),
+                        queue=message.queue.value,
+                        task_id=f"{message.stage_id}:{message.attempt}",
+                        producer=producer,
+                        ignore_result=True,
+                    )
+        except (CeleryOperationalError, KombuOperationalError, redis.RedisError, OSError) as error:
+            raise QueueUnavailable(f"the queue does not answer: {error}") from error
+
+    def depth(self) -> dict[QueueName, int]:
+        """Messages waiting in each queue."""
+        with _RedisErrors():
+            return {name: self._redis.llen(name.value) for name in QueueName}
+
+    def pending(self, queue: QueueName) -> set[tuple[str, int]]:
+        """The (stage id, attempt) of every message waiting in a queue."""
+        with _RedisErrors():
+            raw = cast("list[bytes]", self._redis.lrange(queue.value, 0, -1))
+        return {pair for message in raw if (pair := _identity(message)) is not None}
+
+    def ping(self) -> None:
+        """Raise QueueUnavailable unless Redis answers."""
+        with _RedisErrors():
+            self._redis.ping()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._app.close()
+        self._redis.close()
+
+
+class _RedisErrors:
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, redis.RedisError | OSError):
+            raise QueueUnavailable(f"the queue does not answer: {error}") from error
+
+
+def _identity(message: bytes) -> tuple[str, int] | None:
+    try:
+        stage_id, _, attempt = json.loads(message)["headers"]["id"].rpartition(":")
+        return stage_id, int(attempt)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None  # not one of ours

@@ -1,0 +1,165 @@
+"""Every knob of the service in one object, read from the environment (prefix ``L3PS_``).
+
+The same code serves the embedded stack, one machine and a cluster; only the URLs differ.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+from urllib.parse import parse_qs, unquote, urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+MiB = 1024 * 1024
+GiB = 1024 * MiB
+
+
+class S3Location(BaseModel):
+    """An S3 bucket as named by ``s3://KEY:SECRET@host:port/bucket?secure=0&region=…``."""
+
+    model_config = ConfigDict(frozen=True)
+
+    endpoint: str
+    bucket: str
+    access_key: str
+    secret_key: SecretStr
+    secure: bool = True
+    region: str = "us-east-1"
+
+    @classmethod
+    def parse(cls, url: str) -> S3Location:
+        """Read the URL; ValueError says what is missing."""
+        parts = urlsplit(url)
+        query = parse_qs(parts.query)
+        bucket = parts.path.strip("/")
+        if parts.scheme != "s3" or not parts.hostname or not bucket or "/" in bucket:
+            raise ValueError("an S3 location is s3://KEY:SECRET@host:port/bucket?secure=0|1")
+        if not parts.username or not parts.password:
+            raise ValueError("the S3 location carries no credentials: s3://KEY:SECRET@host:port/bucket")
+        return cls(
+            endpoint=parts.hostname + (f":{parts.port}" if parts.port else ""),
+            bucket=bucket,
+            access_key=unquote(parts.username),
+            secret_key=SecretStr(unquote(parts.password)),
+            secure=query.get("secure", ["1"])[0] not in ("0", "false", "no"),
+            region=query.get("region", ["us-east-1"])[0],
+        )
+
+
+class Settings(BaseSettings):
+    """Settings of every process of the service.
+
+    A field's comment gives the measurement or the rule behind its default.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="L3PS_", extra="ignore")
+
+    data_dir: Path = Field(default_factory=lambda: Path.home() / ".local" / "share" / "l3ps")
+    database_url: str = ""  # empty: SQLite in data_dir
+    redis_url: str = "redis://127.0.0.1:6379/0"  # or unix:///path/redis.sock
+    objects_url: str = ""  # file:///DIR or s3://KEY:SECRET@host:port/bucket?secure=0; empty: data_dir/objects
+    # Where clients reach the S3 server, if not where the services reach it (inside compose: minio:9000, outside:
+    # localhost:9000). A signature covers the host name, so it cannot be rewritten later. scheme://host:port
+    objects_public_url: str | None = None
+    # Where clients reach the API; the directory store's presigned URLs start with it.
+    public_url: str = ""  # empty: http://host:port
+    host: str = "127.0.0.1"
+    port: int = 8080
+    token: SecretStr | None = None  # None: no authentication, for loopback only
+
+    scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
+    # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
+    # recordings met here unpack to well under 1 GB per 40 keyframes with six cameras.
+    scratch_bytes: int = 20 * GiB
+
+    # Limits against archive bombs; the unpacker knows what they mean.
+    unpack_max_bytes: int = 200 * GiB
+    unpack_max_files: int = 2_000_000
+    unpack_max_ratio: float = 200.0
+
+    max_upload_bytes: int = 64 * GiB
+    max_model_bytes: int = 512 * MiB
+    part_bytes: int = 16 * MiB  # at least; larger where an upload would need more than S3's 10,000 parts
+    upload_ttl_seconds: int = 24 * 3600  # an upload not completed by then is aborted and its parts deleted
+    url_ttl_seconds: int = 3600
+    migrate_on_start: bool | None = None  # None: when the catalog is SQLite; elsewhere a step of its own does it
+
+    # A stage belongs to its worker for this long after the last sign of life. Heartbeats come from a thread, so the
+    # longest stretch in which compiled code holds the interpreter lock must fit in (see the worker's heartbeat).
+    lease_seconds: float = 120.0
+    heartbeat_seconds: float = 10.0
+    max_attempts: int = 3
+    retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
+    reconcile_seconds: float = 5.0
+    # A queued stage without a claim for this long whose message is not in the queue is sent again.
+    resend_seconds: float = 30.0
+    # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
+    stage_seconds: float = 4 * 3600.0
+    progress_seconds: float = 0.5
+
+    threads: int = 2  # of numeric libraries, per worker process
+    concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
+
+    metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    log_format: Literal["json", "console"] = "json"
+
+    @field_validator("database_url")
+    @classmethod
+    def _psycopg(cls, value: str) -> str:
+        for scheme in ("postgresql://", "postgres://"):
+            if value.startswith(scheme):
+                return "postgresql+psycopg://" + value.removeprefix(scheme)
+        if value and not value.startswith(("sqlite:///", "postgresql+psycopg://")):
+            raise ValueError("the catalog is sqlite:///PATH or postgresql://USER:PASSWORD@HOST/DATABASE")
+        return value
+
+    @field_validator("objects_url")
+    @classmethod
+    def _known_store(cls, value: str) -> str:
+        if value.startswith("s3://"):
+            S3Location.parse(value)
+        elif value and not value.startswith("file:///"):
+            raise ValueError("the object store is file:///DIR or s3://KEY:SECRET@host:port/bucket")
+        return value
+
+    @property
+    def catalog_url(self) -> str:
+        """The SQLAlchemy URL of the catalog."""
+        return self.database_url or f"sqlite:///{self.data_dir / 'catalog.db'}"
+
+    @property
+    def migrates_on_start(self) -> bool:
+        """Whether the API brings the catalog to the current schema itself."""
+        return self.catalog_url.startswith("sqlite") if self.migrate_on_start is None else self.migrate_on_start
+
+    @property
+    def store_url(self) -> str:
+        """The object store's URL."""
+        return self.objects_url or (self.data_dir / "objects").absolute().as_uri()
+
+    @property
+    def api_url(self) -> str:
+        """Where clients reach the API, without a trailing slash."""
+        return (self.public_url or f"http://{self.host}:{self.port}").rstrip("/")
+
+    @property
+    def scratch(self) -> Path:
+        """Where workers unpack."""
+        return self.scratch_dir or self.data_dir / "scratch"
+
+    @property
+    def broker_url(self) -> str:
+        """The Redis URL in kombu's spelling (it calls a UNIX socket ``redis+socket``)."""
+        if self.redis_url.startswith("unix://"):
+            return "redis+socket://" + self.redis_url.removeprefix("unix://")
+        return self.redis_url
+
+
+@lru_cache(maxsize=1)
+def get_settings() -> Settings:
+    """The process' settings, read once."""
+    return Settings()

@@ -1,0 +1,49 @@
+"""The state machine of drives, models, jobs, scenes and stages. Functions take a transaction and change rows.
+
+accept_drive, accept_model     an upload is complete → ingest
+submit_job, cancel_job         what clients ask for
+claim, heartbeat, report       a worker takes a stage and says it is alive
+complete, drive_checked,       how it ended, and what follows from that
+  model_checked, fail, cancelled
+Reconciler, lease_lost         what nobody is left to report
+"""
+
+from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, heartbeat, report
+from l3ps_platform.workflow.outcomes import (
+    Cost,
+    Retry,
+    cancel_job,
+    cancelled,
+    complete,
+    drive_checked,
+    fail,
+    model_checked,
+    release,
+)
+from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
+from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
+
+__all__ = [
+    "Claim",
+    "Cost",
+    "Reconciler",
+    "Report",
+    "Retry",
+    "accept_drive",
+    "accept_model",
+    "cancel_job",
+    "cancelled",
+    "check_cancelled",
+    "claim",
+    "complete",
+    "drive_checked",
+    "error_json",
+    "fail",
+    "heartbeat",
+    "lease_lost",
+    "model_checked",
+    "problems_of",
+    "release",
+    "report",
+    "submit_job",
+]

@@ -1,0 +1,180 @@
+"""Who owns a stage: a conditional UPDATE decides, a lease bounds it, a heartbeat prolongs it.
+
+The queue may deliver a message twice, late or never; none of that matters here. Every change of a stage names the
+attempt and the owner it believes in and does nothing when the row disagrees.
+
+Rows are locked in one order everywhere: drive, model, job, stage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any, cast
+
+from sqlalchemy import CursorResult, Update, select, update
+
+from l3ps.errors import Cancelled
+from l3ps_platform.catalog import bundles, drives, jobs
+from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow
+from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
+from l3ps_platform.errors import LeaseLost, NotFound
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A stage in this worker's hands.
+
+    Attributes:
+        stage_id: the stage.
+        attempt: which attempt at it this is, from 1.
+        owner: who holds it.
+        name: what to do.
+        lease_seconds: how long the lease runs from each sign of life.
+        job_id, scene_id, drive_id, model_id: whom the stage belongs to.
+    """
+
+    stage_id: str
+    attempt: int
+    owner: str
+    name: StageName
+    lease_seconds: float
+    job_id: str | None = None
+    scene_id: str | None = None
+    drive_id: str | None = None
+    model_id: str | None = None
+
+
+def claim(
+    tx: Transaction, stage_id: str, attempt: int, owner: str, *, lease_seconds: float, max_attempts: int
+) -> Claim | None:
+    """Take a stage, or None when it is not to be had: taken, finished, cancelled, or the message is an old one.
+
+    A running stage whose lease has run out is taken over; that counts as its next attempt, so a stage that kills
+    its workers does not go round for ever.
+    """
+    stage = tx.session.get(StageRow, stage_id)
+    if stage is None:
+        return None
+    job = lock_parents(tx, stage)
+    if job is not None and (job.cancel_requested or job.state.final):
+        return None
+    lease = {
+        "state": StageState.RUNNING,
+        "lease_owner": owner,
+        "lease_until": tx.now + timedelta(seconds=lease_seconds),
+        "started_at": tx.now,
+        "progress_step": None,
+        "progress_done": 0,
+        "progress_total": 0,
+        "fraction": 0.0,
+    }
+    mine = (StageRow.id == stage_id, StageRow.attempt == attempt)
+    if changed(tx, update(StageRow).where(*mine, StageRow.state == StageState.QUEUED).values(**lease)):
+        taken = attempt
+    else:
+        abandoned = (StageRow.state == StageState.RUNNING, StageRow.lease_until < tx.now)
+        if attempt >= max_attempts or not changed(
+            tx, update(StageRow).where(*mine, *abandoned).values(**lease, attempt=attempt + 1)
+        ):
+            return None
+        taken = attempt + 1
+    _mark_parents_running(tx, stage, job)
+    return Claim(
+        stage_id,
+        taken,
+        owner,
+        stage.name,
+        lease_seconds,
+        job_id=stage.job_id,
+        scene_id=stage.scene_id,
+        drive_id=stage.drive_id,
+        model_id=stage.model_id,
+    )
+
+
+def heartbeat(tx: Transaction, claim: Claim) -> None:
+    """Prolong the lease. LeaseLost when the stage is no longer ours."""
+    prolonged = update(StageRow).where(*owned(claim)).values(lease_until=_until(tx, claim))
+    if not changed(tx, prolonged):
+        raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+
+
+def report(tx: Transaction, claim: Claim, step: str, done: int, total: int, *, fraction: float) -> None:
+    """Record progress and prolong the lease.
+
+    Args:
+        tx: the transaction.
+        claim: the stage.
+        step: what the method is doing.
+        done, total: units of that step.
+        fraction: 0..1, over all steps of the stage.
+
+    Raises:
+        LeaseLost: the stage is no longer ours.
+        Cancelled: the job was cancelled.
+    """
+    progress = {"progress_step": step[:32], "progress_done": done, "progress_total": total, "fraction": fraction}
+    if not changed(tx, update(StageRow).where(*owned(claim)).values(lease_until=_until(tx, claim), **progress)):
+        raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+    check_cancelled(tx, claim)
+
+
+def check_cancelled(tx: Transaction, claim: Claim) -> None:
+    """Raise Cancelled when the claim's job is to stop."""
+    if claim.job_id is not None:
+        query = select(JobRow.cancel_requested).where(JobRow.id == claim.job_id)
+        if tx.session.scalar(query):
+            raise Cancelled(f"job {claim.job_id} was cancelled")
+
+
+def owned(claim: Claim) -> tuple[Any, ...]:
+    """The conditions under which a stage is this claim's."""
+    return (
+        StageRow.id == claim.stage_id,
+        StageRow.attempt == claim.attempt,
+        StageRow.lease_owner == claim.owner,
+        StageRow.state == StageState.RUNNING,
+    )
+
+
+def changed(tx: Transaction, statement: Update) -> bool:
+    """Run a conditional UPDATE; whether it changed a row."""
+    options = {"synchronize_session": False}
+    result = cast("CursorResult[Any]", tx.session.execute(statement, execution_options=options))
+    return result.rowcount > 0
+
+
+def lock_parents(tx: Transaction, stage: StageRow) -> JobRow | None:
+    """Hold the rows that a stage's change of state may touch, always in the same order; its job, if it has one."""
+    if stage.drive_id is not None:
+        drives.lock(tx.session, stage.drive_id)
+    if stage.model_id is not None:
+        bundles.lock(tx.session, stage.model_id)
+    if stage.job_id is None:
+        return None
+    try:
+        return jobs.lock(tx.session, stage.job_id)
+    except NotFound:
+        return None
+
+
+def _until(tx: Transaction, claim: Claim) -> datetime:
+    return tx.now + timedelta(seconds=claim.lease_seconds)
+
+
+def _mark_parents_running(tx: Transaction, stage: StageRow, job: JobRow | None) -> None:
+    if job is not None and job.state is JobState.QUEUED:
+        job.state = JobState.RUNNING
+        job.started_at = tx.now
+    if stage.scene_id is not None:
+        scene = tx.session.get(SceneRow, stage.scene_id)
+        if scene is not None:
+            scene.state = StageState.RUNNING
+    if stage.drive_id is not None:
+        drives.lock(tx.session, stage.drive_id).state = DriveState.VALIDATING
+    if stage.model_id is not None:
+        bundles.lock(tx.session, stage.model_id).state = ModelState.VALIDATING
+    tx.session.flush()
+    tx.session.refresh(stage)

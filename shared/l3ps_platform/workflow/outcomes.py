@@ -1,0 +1,252 @@
+"""What a stage's end means for its scene, its job or its drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+
+from sqlalchemy import delete, update
+
+from l3ps.errors import Problem
+from l3ps_platform.catalog import bundles, drives, jobs, stages
+from l3ps_platform.catalog.models import JobRow, Json, SceneRow, StageRow, StepRow
+from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
+from l3ps_platform.errors import LeaseLost
+from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
+from l3ps_platform.workflow.planning import enqueue, plan_if_ready
+from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle_job
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What an attempt cost and how much it did.
+
+    Attributes:
+        seconds: wall time.
+        cpu_seconds: processor time of the process, all threads.
+        peak_mb: peak resident memory, MB.
+        scans, points: what was processed.
+        cached: the output was there already and nothing was computed.
+        steps: (seconds, peak MB) of each step inside the stage.
+    """
+
+    seconds: float
+    cpu_seconds: float = 0.0
+    peak_mb: float = 0.0
+    scans: int = 0
+    points: int = 0
+    cached: bool = False
+    steps: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """How often a stage may be tried, and the wait before the second time; it doubles each time."""
+
+    max_attempts: int
+    seconds: float
+
+
+def complete(
+    tx: Transaction, claim: Claim, cost: Cost, *, output_key: str | None = None, quality: Json | None = None
+) -> None:
+    """A segment, refine or publish stage is done: record it and enqueue what follows.
+
+    Args:
+        tx: the transaction.
+        claim: the stage.
+        cost: what it cost.
+        output_key: where its output lies.
+        quality: for a refine stage the scene's, for a publish stage the job's.
+
+    Raises:
+        LeaseLost: the stage is no longer ours; nothing was changed.
+    """
+    stage = _finish(tx, claim, StageState.DONE, cost=cost, output_key=output_key)
+    job = jobs.lock(tx.session, _must(stage.job_id))
+    if stage.name is StageName.PUBLISH:
+        job.quality = quality
+    elif stage.scene_id is not None:
+        scene = tx.session.get_one(SceneRow, stage.scene_id)
+        if quality is not None:
+            scene.quality = quality
+        waiting = [s for s in stages.of_scene(tx.session, scene.id) if s.state is StageState.WAITING]
+        if waiting and not job.cancel_requested:
+            enqueue(tx, waiting[0])
+        elif not waiting:
+            scene.state = StageState.DONE
+    settle_job(tx, job)
+
+
+def drive_checked(
+    tx: Transaction,
+    claim: Claim,
+    cost: Cost,
+    *,
+    usable: bool,
+    problems: Sequence[Problem],
+    sha256: str | None = None,
+    format: str | None = None,
+    info: Json | None = None,
+) -> None:
+    """A drive's ingest is done: it is ready or rejected, and jobs that waited for it begin or fail. LeaseLost."""
+    stage = _finish(tx, claim, StageState.DONE, cost=cost)
+    drive = drives.lock(tx.session, _must(stage.drive_id))
+    drive.state = DriveState.READY if usable else DriveState.REJECTED
+    drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    drive.sha256, drive.format, drive.info = sha256, format, info
+    tx.session.flush()
+    _plan_waiting(tx, drive_id=drive.id)
+
+
+def model_checked(
+    tx: Transaction,
+    claim: Claim,
+    cost: Cost,
+    *,
+    problems: Sequence[Problem],
+    sha256: str | None = None,
+    info: Json | None = None,
+) -> None:
+    """A model's ingest is done: it is rejected if there are problems, else ready. LeaseLost."""
+    stage = _finish(tx, claim, StageState.DONE, cost=cost)
+    model = bundles.lock(tx.session, _must(stage.model_id))
+    model.state = ModelState.REJECTED if problems else ModelState.READY
+    model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    model.sha256, model.info = sha256, info
+    tx.session.flush()
+    _plan_waiting(tx, model_id=model.id)
+
+
+def fail(tx: Transaction, claim: Claim, error: Json, *, retry: Retry | None = None, cost: Cost | None = None) -> None:
+    """An attempt failed: it is tried again later if ``retry`` has attempts left, else the stage has failed.
+
+    A failed scene does not stop the others of its job. LeaseLost when the stage is no longer ours.
+    """
+    again = retry is not None and claim.attempt < retry.max_attempts
+    stage = _finish(tx, claim, StageState.WAITING if again else StageState.FAILED, cost=cost, error=error)
+    failed(tx, stage, retry if again else None)
+
+
+def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
+    """The consequences of a failed attempt whose row is already marked; ``retry`` when it is to be tried again."""
+    job = lock_parents(tx, stage)
+    if job is not None and job.cancel_requested:
+        stage.state = StageState.CANCELLED
+        cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
+        settle_job(tx, job)
+    elif retry is not None:
+        stage.state = StageState.WAITING
+        stage.not_before = tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.attempt - 1))
+        stage.attempt += 1
+        tx.session.flush()
+    elif job is not None:
+        cancel_rest_of_scene(tx, stage, StageState.FAILED)
+        settle_job(tx, job)
+    else:
+        _reject_unchecked(tx, stage)
+
+
+def cancelled(tx: Transaction, claim: Claim, cost: Cost | None = None) -> None:
+    """The worker saw the cancel flag and stopped. LeaseLost when the stage is no longer ours."""
+    stage = _finish(tx, claim, StageState.CANCELLED, cost=cost)
+    cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
+    settle_job(tx, jobs.lock(tx.session, _must(stage.job_id)))
+
+
+def release(tx: Transaction, claim: Claim) -> None:
+    """Give a stage back because this worker stops: it is queued again and no attempt is counted. LeaseLost."""
+    stage = _finish(tx, claim, StageState.QUEUED)
+    job = lock_parents(tx, stage)
+    if job is not None and job.cancel_requested:
+        failed(tx, stage, None)
+    else:
+        enqueue(tx, stage)
+
+
+def cancel_job(tx: Transaction, job_id: str) -> JobRow:
+    """Stop a job: what has not begun never will, what runs stops at its next scan. A finished job stays as it is.
+
+    NotFound when there is no such job.
+    """
+    job = jobs.lock(tx.session, job_id)
+    if job.state.final:
+        return job
+    job.cancel_requested = True
+    idle = (StageState.WAITING, StageState.QUEUED)
+    for stage in stages.of_job(tx.session, job_id):
+        stop = update(StageRow).where(StageRow.id == stage.id, StageRow.state.in_(idle))
+        if changed(tx, stop.values(state=StageState.CANCELLED, finished_at=tx.now)):
+            tx.session.refresh(stage)
+    running = {s.scene_id for s in stages.of_job(tx.session, job_id) if s.state is StageState.RUNNING}
+    for scene in jobs.scenes(tx.session, job_id):
+        if not scene.state.final and scene.id not in running:
+            scene.state = StageState.CANCELLED
+    settle_job(tx, job)
+    return job
+
+
+def _finish(
+    tx: Transaction,
+    claim: Claim,
+    state: StageState,
+    *,
+    cost: Cost | None = None,
+    output_key: str | None = None,
+    error: Json | None = None,
+) -> StageRow:
+    stage = tx.session.get(StageRow, claim.stage_id)
+    if stage is None:
+        raise LeaseLost(f"stage {claim.stage_id} is gone")
+    lock_parents(tx, stage)
+    values: dict[str, object] = {"state": state, "lease_owner": None, "lease_until": None, "error": error}
+    values |= {"output_key": output_key, "finished_at": tx.now if state.final else None}
+    if cost is not None:
+        values |= {"seconds": cost.seconds, "cpu_seconds": cost.cpu_seconds, "peak_mb": cost.peak_mb}
+        values |= {"scans": cost.scans, "points": cost.points, "cached": cost.cached}
+    if state is StageState.DONE:
+        values["fraction"] = 1.0
+    if not changed(tx, update(StageRow).where(*owned(claim)).values(**values)):
+        raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+    if cost is not None:
+        tx.session.execute(delete(StepRow).where(StepRow.stage_id == claim.stage_id))
+        for name, (seconds, peak_mb) in cost.steps.items():
+            tx.session.add(StepRow(stage_id=claim.stage_id, name=name[:32], seconds=seconds, peak_mb=peak_mb))
+    tx.session.flush()
+    tx.session.refresh(stage)
+    return stage
+
+
+def _plan_waiting(tx: Transaction, *, drive_id: str | None = None, model_id: str | None = None) -> None:
+    for job in jobs.unplanned(tx.session, drive_id=drive_id, model_id=model_id):
+        drive = drives.get(tx.session, job.drive_id) if drive_id is None else drives.lock(tx.session, drive_id)
+        model = bundles.get(tx.session, job.model_id)
+        plan_if_ready(tx, job, drive, model)
+    tx.session.flush()
+
+
+def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
+    """An upload that could not be checked is no use to anyone: reject it and say why."""
+    problem = Problem(
+        code="not-checked",
+        where="upload",
+        what=f"it could not be checked: {(stage.error or {}).get('message', 'unknown error')}",
+        remedy="Upload it again; if that does not help, ask whoever runs the service.",
+    )
+    kept = {"problems": [problem.as_dict()]}
+    if stage.drive_id is not None:
+        drive = drives.lock(tx.session, stage.drive_id)
+        drive.state, drive.problem = DriveState.REJECTED, kept
+    if stage.model_id is not None:
+        model = bundles.lock(tx.session, stage.model_id)
+        model.state, model.problem = ModelState.REJECTED, kept
+    tx.session.flush()
+    _plan_waiting(tx, drive_id=stage.drive_id, model_id=stage.model_id)
+
+
+def _must(id: str | None) -> str:
+    if id is None:
+        raise ValueError("the stage has no such parent")
+    return id

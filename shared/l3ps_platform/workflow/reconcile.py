@@ -1,0 +1,196 @@
+"""The broom: finds what crashes, lost messages and impatient clients leave behind, and puts it right.
+
+Runs in a thread of the API; several may run at once, since every change is conditional.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
+
+import structlog
+from sqlalchemy import select, update
+
+from l3ps_platform.catalog import bundles, drives, uploads
+from l3ps_platform.catalog.models import DriveRow, ModelRow, StageRow
+from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
+from l3ps_platform.catalog.states import QueueName, StageState, UploadState
+from l3ps_platform.errors import Conflict, PlatformError
+from l3ps_platform.objects import ObjectStore
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.claims import changed, lock_parents
+from l3ps_platform.workflow.outcomes import Retry, failed
+from l3ps_platform.workflow.planning import enqueue
+
+if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it
+    from l3ps_platform.queue import Queue
+
+log = structlog.get_logger(__name__)
+
+LOST = {"message": "the worker that ran this stage stopped answering", "problems": []}
+BATCH = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """How much one round put right."""
+
+    expired: int = 0
+    retried: int = 0
+    resent: int = 0
+    uploads: int = 0
+    archives: int = 0
+
+
+class Reconciler:
+    """Rounds over the catalog.
+
+    Args:
+        catalog: whose sender is ``queue.send``.
+        queue: to see which messages are still on their way.
+        store: to drop abandoned uploads and archives of rejected drives.
+        settings: intervals and limits.
+    """
+
+    def __init__(self, catalog: Catalog, queue: Queue, store: ObjectStore, settings: Settings) -> None:
+        self._catalog = catalog
+        self._queue = queue
+        self._store = store
+        self._settings = settings
+        self._retry = Retry(settings.max_attempts, settings.retry_seconds)
+
+    def run(self, stop: threading.Event) -> None:
+        """Rounds until ``stop`` is set; a round that fails is logged and the next one tries again."""
+        while not stop.wait(self._settings.reconcile_seconds):
+            try:
+                report = self.run_once()
+                if report != Report():
+                    log.info("reconciled", **{name: getattr(report, name) for name in Report.__slots__})
+            except PlatformError as error:
+                log.warning("reconciler waits", reason=str(error))
+            except Exception:
+                log.exception("reconciler failed")
+
+    def run_once(self) -> Report:
+        """One round."""
+        return Report(
+            expired=self._expire_leases(),
+            retried=self._release_retries(),
+            resent=self._resend(),
+            uploads=self._abort_uploads(),
+            archives=self._delete_archives(),
+        )
+
+    def _expire_leases(self) -> int:
+        count = 0
+        for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
+            with self._catalog.transaction() as tx:
+                count += lease_lost(tx, stage_id, self._retry, expired_before=tx.now)
+        return count
+
+    def _release_retries(self) -> int:
+        count = 0
+        waiting = (StageRow.state == StageState.WAITING, StageRow.not_before.is_not(None))
+        for stage_id in self._ids(*waiting, StageRow.not_before <= self._now()):
+            with self._catalog.transaction() as tx:
+                stage = tx.session.get(StageRow, stage_id)
+                if stage is None:
+                    continue
+                lock_parents(tx, stage)
+                due = update(StageRow).where(StageRow.id == stage_id, *waiting, StageRow.not_before <= tx.now)
+                if changed(tx, due.values(state=StageState.QUEUED)):
+                    tx.session.refresh(stage)
+                    enqueue(tx, stage)
+                    count += 1
+        return count
+
+    def _resend(self) -> int:
+        """Send again what waits in the catalog and is not in the queue: lost with Redis, or never sent."""
+        stale = self._now() - timedelta(seconds=self._settings.resend_seconds)
+        overdue = self._ids(StageRow.state == StageState.QUEUED, StageRow.queued_at < stale)
+        if not overdue:
+            return 0
+        on_their_way = {pair for name in QueueName for pair in self._queue.pending(name)}
+        with self._catalog.transaction() as tx:
+            query = select(StageRow).where(StageRow.id.in_(overdue), StageRow.state == StageState.QUEUED)
+            for stage in tx.session.scalars(query.with_for_update(skip_locked=True)):
+                if (stage.id, stage.attempt) not in on_their_way:
+                    stage.queued_at = tx.now
+                    tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
+            return len(tx.outbox)
+
+    def _abort_uploads(self) -> int:
+        with self._catalog.reading() as session:
+            rows = uploads.expired(session, self._now())
+        for row in rows:
+            self._store.abort_multipart(row.object_key, row.s3_upload_id)
+            with self._catalog.transaction() as tx:
+                try:
+                    uploads.close(tx, row.id, UploadState.ABORTED)
+                except Conflict:
+                    continue  # completed in this moment; the store then refuses the abort or had no parts left
+        return len(rows)
+
+    def _delete_archives(self) -> int:
+        with self._catalog.reading() as session:
+            found: Iterable[DriveRow | ModelRow] = [
+                *drives.leftover_archives(session),
+                *bundles.leftover_archives(session),
+            ]
+        count = 0
+        for row in found:
+            if row.object_key is not None:
+                self._store.delete(row.object_key)
+            with self._catalog.transaction() as tx:
+                tx.session.merge(row, load=True).object_key = None
+                count += 1
+        return count
+
+    def _ids(self, *conditions: object) -> list[str]:
+        with self._catalog.reading() as session:
+            query = select(StageRow.id).where(*conditions).order_by(StageRow.id).limit(BATCH)  # type: ignore[arg-type]
+            return list(session.scalars(query))
+
+    def _now(self) -> datetime:
+        with self._catalog.reading() as session:
+            return self._catalog.now(session)
+
+
+def lease_lost(
+    tx: Transaction,
+    stage_id: str,
+    retry: Retry,
+    *,
+    expired_before: datetime | None = None,
+    owner_prefix: str | None = None,
+    reason: str | None = None,
+) -> bool:
+    """End a running attempt whose worker is gone: tried again, failed for good, or cancelled with its job.
+
+    Args:
+        tx: the transaction.
+        stage_id: the stage.
+        retry: how often it may be tried.
+        expired_before: only if its lease ended before this.
+        owner_prefix: only if its owner's name begins so (a worker's main process reports its own dead child).
+        reason: what to tell the user.
+    """
+    stage = tx.session.get(StageRow, stage_id)
+    if stage is None:
+        return False
+    lock_parents(tx, stage)
+    conditions = [StageRow.id == stage_id, StageRow.state == StageState.RUNNING]
+    if expired_before is not None:
+        conditions.append(StageRow.lease_until < expired_before)
+    if owner_prefix is not None:
+        conditions.append(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
+    error = LOST if reason is None else {"message": reason, "problems": []}
+    values = {"state": StageState.FAILED, "lease_owner": None, "lease_until": None, "finished_at": tx.now}
+    if not changed(tx, update(StageRow).where(*conditions).values(**values, error=error)):
+        return False
+    tx.session.refresh(stage)
+    failed(tx, stage, retry if stage.attempt < retry.max_attempts else None)
+    return True

@@ -1,0 +1,65 @@
+"""Clusters: partitions stay apart, noise finds a home, odd sizes do no harm."""
+
+import numpy as np
+import pytest
+
+from l3ps.refine.cluster import NOISE, cluster_scene, hdbscan_package, reassign_noise
+
+
+def blob(rng, centre, count=60, spread=0.2):
+    return (np.asarray(centre) + rng.normal(0, spread, (count, 3))).astype(np.float32)
+
+
+def test_distant_blobs_are_clusters_of_their_own_and_nothing_is_noise(rng):
+    points = np.concatenate([blob(rng, (0, 0, 0)), blob(rng, (20, 0, 0)), blob(rng, (0, 20, 0))])
+    labels = cluster_scene(points, np.zeros(180, bool), 5)
+    groups = [set(labels[i : i + 60]) for i in (0, 60, 120)]
+    assert NOISE not in labels
+    assert not groups[0] & groups[1]
+    assert not groups[1] & groups[2]
+
+
+def test_ground_and_object_never_share_a_cluster_even_where_they_touch(rng):
+    points = np.concatenate([blob(rng, (0, 0, 0), 200), blob(rng, (0, 0, 0), 200)])
+    ground = np.repeat([True, False], 200)
+    labels = cluster_scene(points, ground, 5)
+    assert not set(labels[ground]) & set(labels[~ground])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 6])
+def test_tiny_partitions_are_left_alone_or_clustered_but_never_fail(rng, count):
+    labels = cluster_scene(blob(rng, (0, 0, 0), count), np.zeros(count, bool), 5)
+    assert labels.shape == (count,)
+
+
+def test_identical_points_do_not_fail():
+    labels = cluster_scene(np.zeros((50, 3), np.float32), np.zeros(50, bool), 5)
+    assert len(set(labels)) == 1
+
+
+def test_noise_takes_the_majority_of_its_three_nearest():
+    points = np.array([[0, 0, 0], [1, 0, 0], [2.5, 0, 0], [2.9, 0, 0], [2.7, 0, 0]], np.float32)
+    labels = np.array([0, 0, 1, 1, NOISE], np.int32)
+    assert reassign_noise(points, labels).tolist() == [0, 0, 1, 1, 1]
+
+
+def test_noise_with_three_different_neighbours_takes_the_lowest_id():
+    points = np.array([[0, 0, 0], [0, 1, 0], [0, 2, 0], [0.1, 1.4, 0]], np.float32)
+    assert reassign_noise(points, np.array([2, 1, 0, NOISE], np.int32))[3] == 0
+
+
+def test_all_noise_stays_noise():
+    labels = np.full(4, NOISE, np.int32)
+    assert reassign_noise(np.zeros((4, 3), np.float32), labels).tolist() == [NOISE] * 4
+
+
+def test_cells_stand_for_their_points(rng):
+    points = np.concatenate([blob(rng, (0, 0, 0), 500), blob(rng, (30, 0, 0), 500)])
+    labels = cluster_scene(points, np.zeros(1000, bool), 5, voxel=0.1)
+    assert not set(labels[:500]) & set(labels[500:])
+
+
+def test_the_package_is_called_with_the_published_parameters(rng):
+    points = np.concatenate([blob(rng, (i * 10, 0, 0), 4) for i in range(5)])
+    assert len(set(hdbscan_package(points, 3, 1)) - {NOISE}) == 5, "s = 3 finds groups of 4"
+    assert len(set(hdbscan_package(points, 5, 1)) - {NOISE}) < 5, "s = 5 does not"
