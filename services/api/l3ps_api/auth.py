@@ -13,9 +13,7 @@ from l3ps_api.problems import ApiProblem, ErrorItem
 _bearer = HTTPBearer(auto_error=False, description="The token of the settings (L3PS_TOKEN), where there is one.")
 
 
-def require_token(
-    request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> None:
+def require_token(request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> None:
     """Let a request pass that carries the token of the settings; anything passes where there is none."""
     token: str | None = request.app.state.token
     if token is None:
@@ -30,5 +28,5 @@ def require_token(
         "Unauthorized",
         f"Authorization: {what}. {remedy}",
         [ErrorItem(where="Authorization", what=what, remedy=remedy)],
-        {"WWW-Authenticate": "Bearer"},
+        headers={"WWW-Authenticate": "Bearer"},
     )

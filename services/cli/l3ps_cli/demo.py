@@ -33,7 +33,9 @@ def demo(
     ] = None,
     model: Annotated[Path | None, typer.Option(help="Model bundle; default: the packaged demo model.")] = None,
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
-    data: Annotated[Path, typer.Option(help="Directory for everything the demo makes.", file_okay=False)] = Path("demo"),
+    data: Annotated[Path, typer.Option(help="Directory for everything the demo makes.", file_okay=False)] = Path(
+        "demo"
+    ),
 ) -> None:
     """Label a drive with the embedded service and show how good the labels are, primal beside refined."""
     start = time.monotonic()
@@ -66,7 +68,7 @@ def demo(
 def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str) -> dict[str, Any]:
     name = ensure_model(client, str(model))
     document = upload_log(client, log)
-    job = create_job(client, document["id"], name, preset)
+    job = create_job(client, document["id"], model=name, preset=preset)
     job = wait_for_job(client, job["id"], err, stack.check)
     if job["state"] != "succeeded":
         fail("\n".join(job_failure(job)), JOB_FAILED)

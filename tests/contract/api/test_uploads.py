@@ -7,6 +7,7 @@ import zipfile
 
 import httpx
 import pytest
+
 from l3ps_platform.catalog import UploadState, uploads
 
 MiB = 1 << 20
@@ -20,20 +21,6 @@ def tar_of(**files: bytes) -> bytes:
             entry.size = len(content)
             tar.addfile(entry, io.BytesIO(content))
     return buffer.getvalue()
-
-
-def assert_problem(answer: httpx.Response, status: int, code: str) -> dict:
-    """The answer is a problem document of this kind, complete enough to act on."""
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    document = answer.json()
-    assert document["type"] == f"urn:l3ps:problem:{code}"
-    assert document["status"] == status
-    assert document["instance"] == answer.request.url.path
-    assert document["title"] and document["detail"]
-    for error in document["errors"]:
-        assert error["where"] and error["what"] and error["remedy"]
-    return document
 
 
 @pytest.fixture
@@ -66,7 +53,7 @@ def test_an_archive_in_several_parts_becomes_a_drive(service):
 
 def test_an_empty_file_is_refused_at_once(service, nothing_kept):
     answer = service.http.post("/v1/uploads", json={"kind": "drive", "filename": "log.zip", "size": 0})
-    document = assert_problem(answer, 422, "empty-upload")
+    document = service.refused(answer, 422, "empty-upload")
     assert document["errors"][0]["where"] == "size"
     assert "0 bytes" in document["detail"]
 
@@ -75,18 +62,18 @@ def test_a_file_that_arrives_empty_is_refused(service, nothing_kept):
     upload = service.announce(10)
     parts = service.put_parts(upload, b"")
     answer = service.http.post(f"/v1/uploads/{upload['id']}/complete", json={"parts": parts})
-    assert "0 bytes arrived" in assert_problem(answer, 422, "wrong-size")["detail"]
+    assert "0 bytes arrived" in service.refused(answer, 422, "wrong-size")["detail"]
 
 
 def test_what_is_no_archive_is_refused_and_forgotten(service, nothing_kept):
     upload = service.announce(11, "log.zip")
     parts = service.put_parts(upload, b"not a zip!!")
     path = f"/v1/uploads/{upload['id']}"
-    document = assert_problem(service.http.post(f"{path}/complete", json={"parts": parts}), 422, "not-an-archive")
+    document = service.refused(service.http.post(f"{path}/complete", json={"parts": parts}), 422, "not-an-archive")
     assert document["errors"][0]["where"] == "log.zip"
     assert "6e 6f 74" in document["detail"] and ".tar.zst" in document["detail"]
     assert service.http.get(path).json()["state"] == "aborted"
-    assert_problem(service.http.post(f"{path}/complete", json={"parts": parts}), 409, "upload-closed")
+    service.refused(service.http.post(f"{path}/complete", json={"parts": parts}), 409, "upload-closed")
 
 
 @pytest.mark.parametrize("head", [b"PK\x03\x04", b"\x1f\x8b\x08", b"\x28\xb5\x2f\xfd", bytes(257) + b"ustar"])
@@ -100,7 +87,7 @@ def test_a_file_of_another_size_than_announced_is_refused(service, nothing_kept)
     upload = service.announce(len(data) + 1)
     parts = service.put_parts(upload, data)
     answer = service.http.post(f"/v1/uploads/{upload['id']}/complete", json={"parts": parts})
-    assert_problem(answer, 422, "wrong-size")
+    service.refused(answer, 422, "wrong-size")
 
 
 def test_a_wrong_etag_names_the_parts_and_the_upload_can_go_on(service):
@@ -109,14 +96,14 @@ def test_a_wrong_etag_names_the_parts_and_the_upload_can_go_on(service):
     parts = service.put_parts(upload, data)
     path = f"/v1/uploads/{upload['id']}/complete"
     bad = [{"number": 1, "etag": "0" * 32}]
-    assert assert_problem(service.http.post(path, json={"parts": bad}), 422, "invalid-parts")["errors"]
-    assert_problem(service.http.post(path, json={"parts": [*parts, *bad]}), 422, "invalid-parts")
+    assert service.refused(service.http.post(path, json={"parts": bad}), 422, "invalid-parts")["errors"]
+    service.refused(service.http.post(path, json={"parts": [*parts, *bad]}), 422, "invalid-parts")
     assert service.http.post(path, json={"parts": parts}).status_code == 202
 
 
 def test_a_file_over_the_limit_is_refused_before_a_byte_is_sent(service, nothing_kept):
     answer = service.http.post("/v1/uploads", json={"kind": "drive", "filename": "log.tar", "size": 1 << 50})
-    assert "L3PS_MAX_UPLOAD_BYTES" in assert_problem(answer, 413, "too-large")["detail"]
+    assert "L3PS_MAX_UPLOAD_BYTES" in service.refused(answer, 413, "too-large")["detail"]
 
 
 def test_an_aborted_upload_leaves_no_parts(service, nothing_kept):
@@ -125,15 +112,15 @@ def test_an_aborted_upload_leaves_no_parts(service, nothing_kept):
     parts = service.put_parts(upload, data)
     path = f"/v1/uploads/{upload['id']}"
     assert service.http.delete(path).status_code == 204
-    assert_problem(service.http.post(f"{path}/complete", json={"parts": parts}), 409, "upload-closed")
-    assert_problem(service.http.delete(path), 409, "conflict")
+    service.refused(service.http.post(f"{path}/complete", json={"parts": parts}), 409, "upload-closed")
+    service.refused(service.http.delete(path), 409, "conflict")
     with service.catalog.reading() as session:
         assert uploads.get(session, upload["id"]).state is UploadState.ABORTED
     assert httpx.put(upload["parts"][0]["url"], content=data).is_error
 
 
 def test_an_unknown_upload_is_a_404(service):
-    assert_problem(service.http.get("/v1/uploads/upl_nothing"), 404, "unknown-upload")
+    service.refused(service.http.get("/v1/uploads/upl_nothing"), 404, "unknown-upload")
 
 
 def test_a_models_name_is_taken_by_other_content_but_not_by_its_own(service):
@@ -151,12 +138,12 @@ def test_a_models_name_is_taken_by_other_content_but_not_by_its_own(service):
     assert first.status_code == 202, first.text
     kept = service.objects()
     assert upload(bundle(b"one")).json()["id"] == first.json()["id"]
-    assert_problem(upload(bundle(b"two")), 409, "name-taken")
+    service.refused(upload(bundle(b"two")), 409, "name-taken")
     assert service.objects() == kept
     assert service.http.get("/v1/models/tiny-name").json()["id"] == first.json()["id"]
 
 
 def test_a_models_name_must_be_usable_in_a_path(service, nothing_kept):
     answer = service.upload(b"PK\x03\x04....", "tiny.zip", "model", name="a/b")
-    assert assert_problem(answer, 422, "bad-name")["errors"][0]["where"] == "name"
+    assert service.refused(answer, 422, "bad-name")["errors"][0]["where"] == "name"
     service.http.delete(answer.request.url.path.removesuffix("/complete"))

@@ -10,7 +10,7 @@ from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StageState, StepRow, bundles, drives, jobs, stages
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
 from l3ps_platform.workflow import cancel_job, submit_job
 
 
@@ -41,7 +41,9 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
         progress = stages.progress(session, [row.id for row in shown])
     summaries = [
         JobSummary(
-            **summary_fields(row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress[row.id]))
+            **summary_fields(
+                row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress.get(row.id, (0.0, 0)))
+            )
         )
         for row in shown
     ]
@@ -68,7 +70,7 @@ def _document(session: Session, job: JobRow) -> Job:
     steps = stages.steps(session, [row.id for row in rows])
     drive = drives.many(session, [job.drive_id])[job.drive_id]
     model = bundles.get(session, job.model_id)
-    done = sum(_done(row) for row in planned)
+    done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
         return [_stage(row, steps[row.id]) for row in chosen]
@@ -108,13 +110,6 @@ def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
         finished_at=row.finished_at,
         steps=[Step(name=step.name, seconds=step.seconds, peak_mb=step.peak_mb) for step in steps],
     )
-
-
-def _done(row: StageRow) -> float:
-    """How much of a stage is done, 0 to 1, its current step taken for the whole."""
-    if row.state is StageState.DONE:
-        return 1.0
-    return min(1.0, row.progress_done / row.progress_total) if row.progress_total else 0.0
 
 
 def _share(job: JobRow, done: float, total: int) -> float:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from l3ps_platform.catalog import JobRow, JobState, StageName, jobs, stages
-
 from l3ps_api.labels.schemas import LabelFile, LabelFiles
 from l3ps_api.problems import ApiProblem, conflict, invalid
 from l3ps_api.services import Services
+from l3ps_platform.catalog import JobRow, JobState, StageName, jobs, stages
 
 
 def files(services: Services, job_id: str, label_format: str | None) -> LabelFiles:

@@ -11,7 +11,7 @@ from l3ps_platform.catalog.migrate import is_current
 from l3ps_platform.errors import CatalogUnavailable, PlatformError
 
 _REMEDIES = {
-    "catalog": "Check the database and L3PS_DATABASE_URL; run `python -m l3ps_platform.catalog.migrate` once a release.",
+    "catalog": "Check the database and L3PS_DATABASE_URL; each release: `python -m l3ps_platform.catalog.migrate`.",
     "store": "Check the object store and L3PS_OBJECTS_URL.",
     "queue": "Check Redis and L3PS_REDIS_URL.",
 }
@@ -32,7 +32,7 @@ def check_all(services: Services) -> dict[str, str]:
     if failed:
         names = ", ".join(item.where for item in failed)
         detail = f"Not ready: {names}. {failed[0].what[:1].upper()}{failed[0].what[1:]}."
-        raise ApiProblem(503, "not-ready", "Not ready", detail, failed, {"Retry-After": "2"})
+        raise ApiProblem(503, "not-ready", "Not ready", detail, failed, headers={"Retry-After": "2"})
     return answers
 
 

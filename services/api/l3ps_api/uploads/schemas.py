@@ -24,6 +24,7 @@ class UploadRequest(BaseModel):
     kind: Kind = Field(description="`drive`: an archive of a drive log; `model`: a zipped model bundle.")
     filename: Name = Field(examples=["2026-11-22-morning.tar"])
     size: int = Field(ge=0, description="Bytes.")
+    sha256: Sha256 | None = Field(default=None, description="Of the whole file; may also come at the completion.")
 
 
 class PartUrl(BaseModel):

@@ -5,12 +5,6 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from l3ps_platform.catalog import ModelState, Transaction, UploadRow, UploadState, bundles, drives, uploads
-from l3ps_platform.errors import Conflict, NotFound, UploadError
-from l3ps_platform.ids import new_id
-from l3ps_platform.objects import Part, segment
-from l3ps_platform.workflow import accept_drive, accept_model
-
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
@@ -18,6 +12,11 @@ from l3ps_api.services import Services
 from l3ps_api.uploads.parts import part_count, part_size
 from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
+from l3ps_platform.catalog import ModelState, Transaction, UploadRow, UploadState, bundles, drives, uploads
+from l3ps_platform.errors import Conflict, NotFound, UploadError
+from l3ps_platform.ids import new_id
+from l3ps_platform.objects import Part, segment
+from l3ps_platform.workflow import accept_drive, accept_model
 
 _PRESIGN_SECONDS = 7 * 24 * 3600
 """S3's limit for the life of a presigned URL."""
@@ -37,7 +36,9 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     if request.size > limit:
         what = f"{request.size} bytes are more than the {limit} bytes a {request.kind} may have"
         remedy = "Split the log into shorter drives" if request.kind == "drive" else "Export a smaller network"
-        raise too_large("size", what, f"{remedy}, or raise L3PS_MAX_{'UPLOAD' if request.kind == 'drive' else 'MODEL'}_BYTES.")
+        raise too_large(
+            "size", what, f"{remedy}, or raise L3PS_MAX_{'UPLOAD' if request.kind == 'drive' else 'MODEL'}_BYTES."
+        )
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/{segment(request.filename)}"
     seconds = min(settings.upload_ttl_seconds, _PRESIGN_SECONDS)
@@ -50,6 +51,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 kind=request.kind,
                 filename=request.filename,
                 size=request.size,
+                sha256=request.sha256,
                 parts=count,
                 object_key=key,
                 s3_upload_id=multipart,
@@ -103,7 +105,7 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         raise refusal
     try:
         with services.catalog.transaction() as tx:
-            result_id, kept = _accept(tx, row, name, completion.sha256)
+            result_id, kept = _accept(tx, row, name, completion.sha256 or row.sha256)
             uploads.close(tx, upload_id, UploadState.COMPLETE, result_id)
     except Conflict as error:
         return _lost_race_or_name(services, row, error)
@@ -190,7 +192,7 @@ def _result(services: Services, row: UploadRow) -> Drive | Model:
         return Model.of(bundles.get(session, row.result_id or ""))
 
 
-def _fields(row: UploadRow) -> dict[str, object]:
+def _fields(row: UploadRow) -> dict[str, Any]:
     names = ("id", "kind", "filename", "size", "state", "result_id", "created_at", "expires_at")
     return {name: getattr(row, name) for name in names}
 
