@@ -7,6 +7,8 @@ import typer
 from l3ps_cli import bench
 from l3ps_cli.demo import demo
 from l3ps_cli.download import download
+from l3ps_cli.draw import draw
+from l3ps_cli.evaluate import evaluate
 from l3ps_cli.jobs import jobs
 from l3ps_cli.label import label
 from l3ps_cli.simulate import simulate
@@ -20,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (label, simulate, up, submit, jobs, download, demo):
+for command in (label, evaluate, draw, simulate, up, submit, jobs, download, demo):
     app.command()(command)
 app.add_typer(bench.app, name="bench")
 

@@ -18,10 +18,15 @@ Clusterer = Callable[[NDArray[np.float32], int, int], NDArray[np.int32]]
 
 
 def hdbscan_package(points: NDArray[np.float32], min_cluster_size: int, threads: int) -> NDArray[np.int32]:
-    """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass."""
+    """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass.
+
+    It runs in this thread alone: asked for more jobs, the package starts processes, which a prefork worker's children
+    may not.
+    """
+    del threads
     if len(points) <= min_cluster_size:
         return np.full(len(points), NOISE, dtype=np.int32)
-    model = hdbscan.HDBSCAN(min_cluster_size=min_cluster_size, core_dist_n_jobs=threads)
+    model = hdbscan.HDBSCAN(min_cluster_size=min_cluster_size, core_dist_n_jobs=1)
     return np.asarray(model.fit_predict(points), dtype=np.int32)
 
 

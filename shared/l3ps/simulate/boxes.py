@@ -23,13 +23,14 @@ def points_inside(points: Double, center: Double, size: tuple[float, float, floa
     """Number of points in a box.
 
     Args:
-        points: (N, 3) in the frame of ``center``'s target, metres.
+        points: (N, 3) in the frame that ``center`` leads to, metres, sorted by x (a scan has hundreds of boxes).
         center: (4, 4) pose of the box's middle.
         size: width, length, height in metres.
     """
     half = np.array([size[1], size[0], size[2]]) / 2
-    near = np.abs(points[:, :2] - center[:2, 3]).max(axis=1) <= np.hypot(half[0], half[1])
-    local = (points[near] - center[:3, 3]) @ center[:3, :3]
+    radius = np.linalg.norm(half)
+    first, last = np.searchsorted(points[:, 0], [center[0, 3] - radius, center[0, 3] + radius])
+    local = (points[first:last] - center[:3, 3]) @ center[:3, :3]
     return int((np.abs(local) <= half).all(axis=1).sum())
 
 

@@ -33,7 +33,8 @@ WIDTH = 704
 JPEG_QUALITY = 92
 MAP_STEP = 0.1
 """Metres a pixel of the map mask; fixed by the devkit."""
-MAP_METRES = 800.0
+MAP_METRES = 500.0
+"""Edge of the mask; the street lies around its middle."""
 
 
 def simulate_drive(
@@ -198,6 +199,7 @@ class _Writer:
         to_street = ego @ lidar.lidar_to_ego()
         to_lidar = np.linalg.inv(to_street)
         points = scan.points[:, :3].astype(np.float64) @ to_street[:3, :3].T + to_street[:3, 3]
+        points = points[np.argsort(points[:, 0], kind="stable")]
         for i, (actor, pose) in enumerate(zip(world.actors, world.poses(time), strict=True)):
             if actor.size is None:
                 continue

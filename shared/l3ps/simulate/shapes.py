@@ -18,6 +18,8 @@ from .textures import SIZE
 
 Float = NDArray[np.float32]
 Double = NDArray[np.float64]
+PARALLEL = np.float32(1e-9)
+"""Keeps a ray that runs parallel to a face from dividing by zero; lost in rounding for every other."""
 
 
 class Kind(IntEnum):
@@ -169,7 +171,7 @@ def _missed(reach: Float, hit: NDArray[np.bool_]) -> Float:
 
 def _box(origin: Float, rays: Float, half: Float) -> Float:
     """Slab test (Kay and Kajiya 1986), all three slabs at once."""
-    inverse = 1 / rays
+    inverse = 1 / (rays + PARALLEL)
     middle = -origin[:, None, None] * inverse
     spread = half[:, None, None] * np.abs(inverse)
     entry = (middle - spread).max(axis=0)
@@ -178,7 +180,7 @@ def _box(origin: Float, rays: Float, half: Float) -> Float:
 
 def _wedge(origin: Float, rays: Float, half: Float, taper: float) -> Float:
     """Two slabs and two leaning planes: |x| ≤ half_x − taper · (z + half_z) / (2 half_z)."""
-    inverse = 1 / rays[1:]
+    inverse = 1 / (rays[1:] + PARALLEL)
     middle = -origin[1:, None, None] * inverse
     spread = half[1:, None, None] * np.abs(inverse)
     entry, leave = (middle - spread).max(axis=0), (middle + spread).min(axis=0)

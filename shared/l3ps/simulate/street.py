@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float32]
+Double = NDArray[np.float64]
 X_MIN, X_MAX = -110.0, 210.0
 """Extent of the built street along x, metres; beyond it the surfaces simply go on."""
 BIN = 0.5
@@ -68,24 +69,20 @@ class Street:
     driveways: NDArray[np.bool_] = field(repr=False)
     island: Float = field(repr=False)
 
-    def place(self, x: float, offset: float) -> tuple[float, float, float]:
-        """Street position of a point beside the centre line.
+    def place(self, x: Double, offset: Double) -> tuple[Double, Double, Double]:
+        """Street positions of points beside the centre line.
 
         Args:
-            x: where along the street, metres.
-            offset: to the left of the centre line, metres.
+            x: (n,) where along the street, metres.
+            offset: (n,) to the left of the centre line, metres.
 
         Returns:
-            x, y in metres and the street's heading there in radians.
+            (n,) x and y in metres and (n,) the street's heading there in radians.
         """
         angle = self.wavenumber * x + self.phase
-        heading = float(np.arctan(self.amplitude * self.wavenumber * np.cos(angle)))
+        heading = np.arctan(self.amplitude * self.wavenumber * np.cos(angle))
         y = self.amplitude * np.sin(angle)
-        return x - offset * np.sin(heading), float(y + offset * np.cos(heading)), heading
-
-    def height(self, offset: float) -> float:
-        """Height of the ground at an offset, side street and islands aside."""
-        return self.kerb if abs(offset) >= self.half_width else 0.0
+        return x - offset * np.sin(heading), y + offset * np.cos(heading), heading
 
     def offset(self, x: Float, y: Float) -> Float:
         """(n,) signed distance from the centre line, positive to the left (first order in the curvature)."""

@@ -46,7 +46,7 @@ def _on_the_map(slope: float, across: float, bearing: float) -> NDArray[np.float
     """(4, 4) street → world."""
     pose = np.eye(4)
     pose[:3, :3] = turn(bearing, slope, across)
-    pose[:3, 3] = 400.0, 400.0, 0.0
+    pose[:3, 3] = 250.0, 250.0, 0.0
     return pose
 
 

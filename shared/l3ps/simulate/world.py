@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,14 +34,18 @@ class Motion:
     heading: float = 0.0
     height: float = 0.0
 
-    def pose(self, street: Street, time: float) -> Double:
-        """(4, 4) object → street."""
-        x, y, along = street.place(self.x + self.speed * time, self.offset)
-        _, raised = street.surface(np.array([x], np.float32), np.array([y], np.float32))
-        pose = np.eye(4)
-        pose[:3, :3] = turn(along + self.heading)
-        pose[:3, 3] = x, y, self.height + street.kerb * bool(raised[0])
-        return pose
+
+def poses(street: Street, motions: Sequence[Motion], time: float) -> Double:
+    """(n, 4, 4) object → street of moving objects at a time in seconds."""
+    x, offset, speed, heading, height = np.array([astuple(m) for m in motions], dtype=np.float64).reshape(-1, 5).T
+    x, y, along = street.place(x + speed * time, offset)
+    _, raised = street.surface(x.astype(np.float32), y.astype(np.float32))
+    matrices = np.zeros((len(x), 4, 4))
+    cos, sin = np.cos(along + heading), np.sin(along + heading)
+    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1] = cos, -sin, sin, cos
+    matrices[:, 0, 3], matrices[:, 1, 3], matrices[:, 2, 3] = x, y, height + street.kerb * raised
+    matrices[:, 2, 2] = matrices[:, 3, 3] = 1
+    return matrices
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,8 @@ class World:
             "_owner": np.array([i for i, _ in parts], np.int32),
             "_center": np.array([p.center for _, p in parts]),
             "_turn": np.array([turn(*p.angles) for _, p in parts]),
-            "_fixed": np.array([a.motion.pose(self.street, 0.0) for a in self.actors]),
+            "_fixed": poses(self.street, [a.motion for a in self.actors], 0.0),
+            "_moving": np.flatnonzero([a.motion.speed != 0 for a in self.actors]),
             "kind": np.array([p.kind for _, p in parts], np.uint8),
             "half": np.array([p.half for _, p in parts]),
             "taper": np.array([p.taper for _, p in parts]),
@@ -147,6 +153,7 @@ class World:
     _center: Double = field(init=False, repr=False)
     _turn: Double = field(init=False, repr=False)
     _fixed: Double = field(init=False, repr=False)
+    _moving: NDArray[np.intp] = field(init=False, repr=False)
     kind: NDArray[np.uint8] = field(init=False, repr=False)
     half: Double = field(init=False, repr=False)
     taper: Double = field(init=False, repr=False)
@@ -159,11 +166,9 @@ class World:
 
     def poses(self, time: float) -> Double:
         """(A, 4, 4) actor → street at a time in seconds."""
-        poses = self._fixed.copy()
-        for i, actor in enumerate(self.actors):
-            if actor.motion.speed:
-                poses[i] = actor.motion.pose(self.street, time)
-        return poses
+        placed = self._fixed.copy()
+        placed[self._moving] = poses(self.street, [self.actors[i].motion for i in self._moving], time)
+        return placed
 
     def solids(self, time: float) -> Solids:
         """All solids where they are at a time in seconds."""
@@ -173,4 +178,4 @@ class World:
 
     def ego_pose(self, time: float) -> Double:
         """(4, 4) ego → street."""
-        return self.ego.pose(self.street, time)
+        return np.asarray(poses(self.street, [self.ego], time)[0])
