@@ -12,7 +12,7 @@ import typer
 from l3ps_cli.client import Client
 from l3ps_cli.console import JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.download import DamagedDownloadError, fetch_labels
-from l3ps_cli.pictures import draw_scan
+from l3ps_cli.draw import draw
 from l3ps_cli.processes import ChildDiedError
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table, stage_table
@@ -58,8 +58,8 @@ def demo(
     else:
         out.print("The log carries no truth, so there are no quality figures.")
     out.print(f"labels: {labels}", highlight=False, soft_wrap=True)
-    for picture in draw_scan(log, labels / "refined", data / "pictures"):
-        out.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+    for coloring in ("class", "instance"):
+        draw(log, output=data / f"{coloring}.png", labels=labels / "refined", by=coloring)
     out.print(f"{time.monotonic() - start:.0f} seconds in all", highlight=False)
 
 
