@@ -110,7 +110,7 @@ def refine_scene(
         clouds = [scan.load_points() for scan in scene.scans]
         _check_match(scene.scans, [len(cloud) for cloud in clouds], primal)
         ticked = track(clouds, "accumulate", progress)
-        poses = estimate_poses((cloud.xyz for cloud in ticked), preset.odometry, threads)
+        poses = estimate_poses((cloud.xyz for cloud in ticked), preset.odometry)
         points = np.concatenate([transform(c.xyz, pose) for c, pose in zip(clouds, poses, strict=True)])
 
     with book.span("ground"):

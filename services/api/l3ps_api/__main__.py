@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import uvicorn
-from l3ps_platform.settings import get_settings
-from l3ps_platform.telemetry import configure_logging
 
 from l3ps_api.app import create_app
+from l3ps_platform.settings import get_settings
+from l3ps_platform.telemetry import configure_logging
 
 
 def main() -> None:

@@ -10,14 +10,6 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from l3ps_platform.catalog import Catalog
-from l3ps_platform.catalog.migrate import upgrade
-from l3ps_platform.errors import StoreUnavailable
-from l3ps_platform.metrics import CatalogCollector
-from l3ps_platform.objects import open_store
-from l3ps_platform.queue import Queue
-from l3ps_platform.settings import Settings
-from l3ps_platform.workflow import Reconciler
 from prometheus_client import CollectorRegistry
 
 from l3ps_api import errors, problems
@@ -31,6 +23,14 @@ from l3ps_api.objects.routes import router as objects
 from l3ps_api.services import Services
 from l3ps_api.system.routes import health_router, metrics_router
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_platform.catalog import Catalog
+from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.errors import StoreUnavailable
+from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.objects import open_store
+from l3ps_platform.queue import Queue
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import Reconciler
 
 log = structlog.get_logger(__name__)
 
@@ -63,12 +63,12 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(objects)  # its URLs are signed, each for one act
     for router in (uploads, drives, jobs, labels, models):
         app.include_router(router, dependencies=guarded)
+    errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(BodyLimit, exempt="/v1/objects/")
     if settings.host in ("127.0.0.1", "localhost", "::1") and not settings.public_url:
         app.add_middleware(LoopbackHosts)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
-    errors.install(app)
     problems.describe_in_openapi(app)
     return app
 
@@ -76,8 +76,8 @@ def create_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     services: Services = app.state.services
-    if services.catalog.engine.dialect.name == "sqlite":
-        await run_in_threadpool(upgrade, services.settings.catalog_url)  # embedded: there is no deployment step
+    if services.settings.migrates_on_start:
+        await run_in_threadpool(upgrade, services.settings.catalog_url)
     try:
         await run_in_threadpool(services.store.ensure)
     except StoreUnavailable as error:

@@ -11,7 +11,11 @@ import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
 from l3ps.errors import InputError
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
 from l3ps_platform.errors import (
     CatalogUnavailable,
     Conflict,
@@ -23,18 +27,45 @@ from l3ps_platform.errors import (
     StoreUnavailable,
     UploadError,
 )
-from starlette.exceptions import HTTPException
-
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
 
 log = structlog.get_logger(__name__)
 Handler = Callable[[Request, Any], Awaitable[JSONResponse]]
 
 
 def install(app: FastAPI) -> None:
-    """Register the handlers."""
+    """Register the handlers; to be called before other middleware is added, which then sees these answers."""
+    app.add_middleware(UnexpectedErrors)
     for kind, translate in _TRANSLATIONS:
         app.add_exception_handler(kind, _handler(translate))
+
+
+class UnexpectedErrors:
+    """Answers with a problem document where nothing else caught an exception, and logs it once.
+
+    A handler for ``Exception`` would not do: Starlette raises it again after the answer, upon which the server closes
+    the connection under a client that may already be sending its next request.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        started = False
+
+        async def observed(message: Message) -> None:
+            nonlocal started
+            started = True
+            await send(message)
+
+        try:
+            await self.app(scope, receive, observed)
+        except Exception as error:
+            if started or scope["type"] != "http":
+                raise
+            log.error("request failed", method=scope["method"], path=scope["path"], exc_info=error)
+            detail = "The service failed at this request; the fault is in the service. Its log says more."
+            problem = ApiProblem(500, "internal", "Internal error", detail)
+            await answer(problem, scope["path"])(scope, receive, send)
 
 
 def _handler(translate: Callable[[Request, Any], ApiProblem]) -> Handler:
@@ -85,7 +116,7 @@ def _http_error(request: Request, error: HTTPException) -> ApiProblem:
         detail = f"{request.method} does not work on {path}; it takes {allowed}."
         errors = [ErrorItem(where="method", what=f"{request.method} is not allowed", remedy=f"Use {allowed}.")]
     code = status.phrase.lower().replace(" ", "-")
-    return ApiProblem(status, code, status.phrase, detail, errors, error.headers)
+    return ApiProblem(status, code, status.phrase, detail, errors, headers=error.headers)
 
 
 def _bad_input(_: Request, error: InputError) -> ApiProblem:
@@ -125,12 +156,6 @@ def _sentence(error: Exception) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def _unexpected(request: Request, error: Exception) -> ApiProblem:
-    log.error("request failed", method=request.method, path=request.url.path, exc_info=error)
-    detail = "The service failed at this request; the fault is in the service. Its log says more."
-    return ApiProblem(500, "internal", "Internal error", detail)
-
-
 _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]], ...] = (
     (ApiProblem, _as_is),
     (RequestValidationError, _invalid_request),
@@ -146,5 +171,4 @@ _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]
     (QueueUnavailable, _down("queue")),
     (CatalogUnavailable, _down("catalog")),
     (sqlalchemy.exc.TimeoutError, _down("catalog")),  # no free connection
-    (Exception, _unexpected),
 )

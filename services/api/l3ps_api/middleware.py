@@ -23,9 +23,7 @@ class RequestMetrics:
     def __init__(self, app: ASGIApp, registry: CollectorRegistry) -> None:
         self.app = app
         labels = ("method", "route")
-        self.requests = Counter(
-            "l3ps_http_requests", "Requests answered.", (*labels, "status"), registry=registry
-        )
+        self.requests = Counter("l3ps_http_requests", "Requests answered.", (*labels, "status"), registry=registry)
         self.seconds = Histogram("l3ps_http_request_seconds", "Time to answer.", labels, registry=registry)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -7,8 +7,9 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import JSONResponse
-from l3ps.errors import Problem
 from pydantic import BaseModel, Field
+
+from l3ps.errors import Problem
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -55,6 +56,7 @@ class ApiProblem(Exception):  # noqa: N818  (it becomes a problem document)
         title: str,
         detail: str,
         errors: Iterable[ErrorItem] = (),
+        *,
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(detail)
@@ -65,7 +67,7 @@ class ApiProblem(Exception):  # noqa: N818  (it becomes a problem document)
 
 def items(problems: Iterable[Problem]) -> list[ErrorItem]:
     """Problems found in a drive log or model bundle as the errors of a document."""
-    return [ErrorItem(**problem.as_dict()) for problem in problems]
+    return [ErrorItem.model_validate(problem.as_dict()) for problem in problems]
 
 
 def stored_items(problems: Iterable[Mapping[str, Any]] | None) -> list[ErrorItem]:

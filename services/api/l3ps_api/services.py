@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
+
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.queue import Queue

@@ -1,7 +1,7 @@
 """The REST API as the commands use it: one class, every failure one of two exceptions.
 
-    ServiceUnreachableError   nobody answers, or the service cannot reach what it needs
-    ServiceProblemError       the service refused; carries its problem document
+ServiceUnreachableError   nobody answers, or the service cannot reach what it needs
+ServiceProblemError       the service refused; carries its problem document
 """
 
 from __future__ import annotations

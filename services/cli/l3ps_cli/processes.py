@@ -66,7 +66,7 @@ class Child:
         """Whether it still runs. On its end the rest of its group is killed and the child reaped."""
         if self.returncode is not None:
             return False
-        # WNOWAIT leaves the zombie, and with it the group's id, in place: no stranger can own that id in the kill below.
+        # WNOWAIT leaves the zombie, and with it the group's id, in place: no stranger can own it in the kill below.
         if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
             return True
         with suppress(ProcessLookupError, PermissionError):

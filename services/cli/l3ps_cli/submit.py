@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from l3ps.errors import DriveLogError, Problem
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
+from l3ps.errors import DriveLogError, Problem
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.packing import ARCHIVE_SUFFIXES, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
@@ -20,6 +20,7 @@ from l3ps_cli.watch import wait_for_job
 
 def submit(
     log: Annotated[Path, typer.Argument(help="Drive log: a directory or an archive.")],
+    *,
     model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
     formats: Annotated[
@@ -41,7 +42,15 @@ def submit(
     with service_errors(), Client() as client:
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
-        job = create_job(client, drive["id"], model_name, preset, formats, protocol, skip_bad_scans)
+        job = create_job(
+            client,
+            drive["id"],
+            model=model_name,
+            preset=preset,
+            formats=formats,
+            protocol=protocol,
+            skip_bad_scans=skip_bad_scans,
+        )
         if wait:
             job = wait_for_job(client, job["id"], err)
     if as_json:
@@ -55,6 +64,7 @@ def submit(
 def create_job(
     client: Client,
     drive_id: str,
+    *,
     model: str,
     preset: str,
     formats: list[str] | None = None,
@@ -123,7 +133,9 @@ def upload_log(client: Client, log: Path) -> dict[str, Any]:
         raise DriveLogError(Problem("no-log", str(log), what, remedy))
     if not is_archive_name(log):
         what = "it is no archive by its name"
-        raise DriveLogError(Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."))
+        raise DriveLogError(
+            Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}.")
+        )
     name = log.name
     for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
         name = name.removesuffix(suffix)

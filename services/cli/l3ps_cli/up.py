@@ -20,7 +20,7 @@ from l3ps_cli.stack import Stack, StackError, StackOptions
 DEFAULT_DATA = Path("~/.local/share/l3ps")
 
 
-class StopRequested(BaseException):  # noqa: N818  (a request, and nothing that catches Exception may swallow it)
+class StopRequested(BaseException):
     """Ctrl-C or SIGTERM."""
 
 
@@ -46,6 +46,7 @@ def stop_on_signals() -> Iterator[None]:
 
 
 def up(
+    *,
     data: Annotated[
         Path, typer.Option(help="Directory that holds everything.", envvar="L3PS_DATA_DIR", file_okay=False)
     ] = DEFAULT_DATA,

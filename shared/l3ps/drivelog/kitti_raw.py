@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import DriveLogError, Problem
 from ..geometry import Matrix, orthonormal, transform
 from . import kitti
-from .names import is_plain_name
+from .names import is_file_name
 from .points import COLUMNS, read_points, relative
 from .types import CameraFrame, Drive, Scan, Scene
 
@@ -46,7 +46,7 @@ def open_kitti_raw(root: Path, drives: list[Path]) -> Drive:
     calibrations: dict[Path, list[Camera] | None] = {}
     for folder in drives:
         where = relative(folder, root)
-        if not is_plain_name(folder.name):
+        if not is_file_name(folder.name):
             problems.append(Problem("bad-name", where, "the folder's name has odd characters", "Rename the folder"))
             continue
         home = folder if (folder / "calib_velo_to_cam.txt").is_file() else folder.parent

@@ -12,13 +12,19 @@ from typing import Final
 
 from ..errors import Problem
 
+_FILE: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,127}")
 _PLAIN: Final = re.compile(r"[\w+-][\w .+-]{0,126}[\w+-]|[\w+-]")
 
 
-def is_plain_name(value: object) -> bool:
-    """Whether a scene, channel or token may name a file.
+def is_file_name(value: object) -> bool:
+    """Whether a token may name a file: at most 128 ASCII letters, digits and ``. _ + -``, a letter or digit first."""
+    return isinstance(value, str) and _FILE.fullmatch(value) is not None
 
-    At most 128 letters, digits, spaces and ``. _ + -``; no dot or space first or last.
+
+def is_plain_name(value: object) -> bool:
+    """Whether a scene or channel may be shown and name a folder.
+
+    At most 128 letters of any script, digits, spaces and ``. _ + -``; no dot or space first or last.
     """
     return isinstance(value, str) and _PLAIN.fullmatch(value) is not None
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import DriveLogError, Problem
 from ..taxonomy import NUSCENES_RAW_INDEX, nuscenes_raw_lut
-from .names import is_plain_name
+from .names import is_file_name, is_plain_name
 from .nuscenes_truth import TruthKind
 from .tables import Row, Table, is_flag, is_integer, is_list, is_text, is_token, read_table, unique
 
@@ -40,7 +40,7 @@ _CALIBRATED: Final = Table(
 _SAMPLE_DATA: Final = Table(
     "sample_data",
     {
-        "token": is_plain_name,
+        "token": is_file_name,
         "sample_token": is_token,
         "ego_pose_token": is_token,
         "calibrated_sensor_token": is_token,

@@ -11,26 +11,34 @@ from .names import is_hidden, subfolders
 from .nuscenes import open_nuscenes
 from .semantickitti import open_semantickitti
 from .types import Drive
+from .validate import validate, without_bad_scans
 
 LOOKED_FOR: Final = "v1.0-*/scene.json, */velodyne_points, sequences/*/velodyne"
 _NESTING: Final = 3
 """Folders an archive may wrap around the log."""
 
 
-def open_drive(path: Path, *, sweeps: bool = False) -> Drive:
+def open_drive(path: Path, *, sweeps: bool = False, skip_bad_scans: bool = False) -> Drive:
     """Open a drive log.
 
     Args:
         path: the folder of the log, a folder around it that holds no other folder, one of its ``v1.0-*`` folders
             (to choose among several), a KITTI day or drive, or one sequence.
         sweeps: nuScenes only: also yield the sweeps between keyframes.
+        skip_bad_scans: validate the log and leave out the scans and scenes that have problems.
 
     Returns:
-        The drive. Scans are found, not read: :func:`l3ps.drivelog.validate` looks at every file.
+        The drive. Without ``skip_bad_scans`` the scans are found, not read: :func:`l3ps.drivelog.validate` looks at
+        every file.
 
     Raises:
         DriveLogError: no log there, or one whose tables or calibration cannot be used; with all problems found.
     """
+    drive = _find(path, sweeps)
+    return without_bad_scans(drive, validate(drive)) if skip_bad_scans else drive
+
+
+def _find(path: Path, sweeps: bool) -> Drive:
     if not path.is_dir():
         what = "it is a file, not a folder" if path.exists() else "there is no such folder"
         raise DriveLogError(Problem("no-log", str(path), what, "Name the folder of a drive log, or unpack the archive"))

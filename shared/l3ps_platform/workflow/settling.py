@@ -64,7 +64,7 @@ def _finish(tx: Transaction, job: JobRow, state: JobState) -> None:
 
 def _scene_counts(tx: Transaction, job_id: str) -> dict[StageState, int]:
     query = select(SceneRow.state, func.count()).where(SceneRow.job_id == job_id).group_by(SceneRow.state)
-    return dict(tx.session.execute(query).tuples().all())
+    return dict(tx.session.execute(query).all())
 
 
 def _publish_stage(tx: Transaction, job_id: str) -> StageRow | None:
@@ -85,7 +85,7 @@ def _errors(tx: Transaction, job_id: str, *, failed: int, total: int) -> Json:
         .where(StageRow.job_id == job_id, StageRow.state == StageState.FAILED)
         .order_by(StageRow.id)
     )
-    rows = tx.session.execute(query).tuples().all()
+    rows = tx.session.execute(query).all()
     reasons = [f"{scene or stage.value}: {(error or {}).get('message', 'no reason')}" for scene, stage, error in rows]
     problems = [problem for _, _, error in rows for problem in (error or {}).get("problems", [])]
     what = f"{failed} of {total} scenes failed" if failed else "the results could not be published"

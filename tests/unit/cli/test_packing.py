@@ -7,6 +7,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
 from l3ps.errors import DriveLogError, ModelError
 from l3ps_cli.packing import bundle_name, pack_bundle, pack_log, sha256_of
 

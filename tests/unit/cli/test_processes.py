@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+
 from l3ps_cli.processes import ChildDiedError, Processes
 
 SLEEP = "import time; time.sleep(600)"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from l3ps_platform.catalog import DriveRow, DriveState
 from pydantic import BaseModel, Field
 
 from l3ps_api.problems import ErrorItem, stored_items
+from l3ps_platform.catalog import DriveRow, DriveState
 
 
 class DriveScene(BaseModel):

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from l3ps_platform.catalog import drives
-
 from l3ps_api.drives.schemas import Drive, DrivePage
 from l3ps_api.services import Services
+from l3ps_platform.catalog import drives
 
 
 def page(services: Services, limit: int, cursor: str | None, sha256: str | None) -> DrivePage:

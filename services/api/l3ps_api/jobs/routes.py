@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-from l3ps_platform.catalog import JobState
 
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
 from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_platform.catalog import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from l3ps_platform.catalog import DriveRow, DriveState, JobRow, JobState, ModelRow, ModelState, StageState
 from pydantic import BaseModel, ConfigDict, Field
 
 from l3ps_api.problems import ErrorItem, stored_items
+from l3ps_platform.catalog import DriveRow, DriveState, JobRow, JobState, ModelRow, ModelState, StageState
 
 Preset = Literal["paper", "best", "fast"]
 LabelFormat = Literal["nuscenes", "semantickitti"]

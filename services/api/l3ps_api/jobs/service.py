@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from l3ps.errors import InputError
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StageState, StepRow, bundles, drives, jobs, stages
-from l3ps_platform.workflow import cancel_job, submit_job
 from sqlalchemy.orm import Session
 
+from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
+from l3ps_platform.workflow import cancel_job, submit_job
 
 
 def create(services: Services, request: JobRequest) -> Job:
@@ -23,7 +23,9 @@ def create(services: Services, request: JobRequest) -> Job:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
         skippable = all(problem.severity == "scan" for problem in found)
-        remedy = "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
+        remedy = (
+            "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
+        )
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
     return get(services, job.id)
@@ -38,7 +40,11 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
         of_model = bundles.many(session, [row.model_id for row in shown])
         progress = stages.progress(session, [row.id for row in shown])
     summaries = [
-        JobSummary(**summary_fields(row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress[row.id])))
+        JobSummary(
+            **summary_fields(
+                row, of_drive[row.drive_id], of_model[row.model_id], _share(row, *progress.get(row.id, (0.0, 0)))
+            )
+        )
         for row in shown
     ]
     return JobPage(items=summaries, next=shown[-1].id if len(rows) > limit else None)
@@ -64,7 +70,7 @@ def _document(session: Session, job: JobRow) -> Job:
     steps = stages.steps(session, [row.id for row in rows])
     drive = drives.many(session, [job.drive_id])[job.drive_id]
     model = bundles.get(session, job.model_id)
-    done = sum(_done(row) for row in planned)
+    done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
         return [_stage(row, steps[row.id]) for row in chosen]
@@ -104,13 +110,6 @@ def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
         finished_at=row.finished_at,
         steps=[Step(name=step.name, seconds=step.seconds, peak_mb=step.peak_mb) for step in steps],
     )
-
-
-def _done(row: StageRow) -> float:
-    """How much of a stage is done, 0 to 1, its current step taken for the whole."""
-    if row.state is StageState.DONE:
-        return 1.0
-    return min(1.0, row.progress_done / row.progress_total) if row.progress_total else 0.0
 
 
 def _share(job: JobRow, done: float, total: int) -> float:

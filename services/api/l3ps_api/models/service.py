@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from l3ps_platform.catalog import bundles
-
 from l3ps_api.models.schemas import Model, ModelPage
 from l3ps_api.services import Services
+from l3ps_platform.catalog import bundles
 
 
 def page(services: Services, limit: int, cursor: str | None) -> ModelPage:

@@ -19,7 +19,8 @@ async def put_object(key: str, request: Request, services: ServicesDep) -> Respo
     return Response(headers={"ETag": f'"{etag}"'})
 
 
-@router.api_route("/{key:path}", methods=["GET", "HEAD"], response_class=FileResponse)
+@router.head("/{key:path}", response_class=FileResponse, include_in_schema=False)
+@router.get("/{key:path}", response_class=FileResponse)
 def get_object(key: str, request: Request, services: ServicesDep) -> FileResponse:
     """Send the object that the URL's signature permits; `Range` is honoured."""
     return service.send(services, service.grant(services, request.method, key, request.query_params))

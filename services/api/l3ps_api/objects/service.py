@@ -7,11 +7,11 @@ from contextlib import ExitStack
 
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse
-from l3ps_platform.objects import DirectoryStore, Grant, content_type
 
 from l3ps_api.problems import ApiProblem, invalid, too_large
 from l3ps_api.services import Services
 from l3ps_api.uploads.parts import largest_part
+from l3ps_platform.objects import DirectoryStore, Grant, content_type
 
 _BLOCK = 1 << 20
 """Bytes collected before they are handed to a thread: the server delivers 64 KB at a time."""

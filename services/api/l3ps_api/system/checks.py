@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+from l3ps_api.problems import ApiProblem, ErrorItem
+from l3ps_api.services import Services
 from l3ps_platform.catalog.migrate import is_current
 from l3ps_platform.errors import CatalogUnavailable, PlatformError
 
-from l3ps_api.problems import ApiProblem, ErrorItem
-from l3ps_api.services import Services
-
 _REMEDIES = {
-    "catalog": "Check the database and L3PS_DATABASE_URL; run `python -m l3ps_platform.catalog.migrate` once a release.",
+    "catalog": "Check the database and L3PS_DATABASE_URL; each release: `python -m l3ps_platform.catalog.migrate`.",
     "store": "Check the object store and L3PS_OBJECTS_URL.",
     "queue": "Check Redis and L3PS_REDIS_URL.",
 }
@@ -33,7 +32,7 @@ def check_all(services: Services) -> dict[str, str]:
     if failed:
         names = ", ".join(item.where for item in failed)
         detail = f"Not ready: {names}. {failed[0].what[:1].upper()}{failed[0].what[1:]}."
-        raise ApiProblem(503, "not-ready", "Not ready", detail, failed, {"Retry-After": "2"})
+        raise ApiProblem(503, "not-ready", "Not ready", detail, failed, headers={"Retry-After": "2"})
     return answers
 
 

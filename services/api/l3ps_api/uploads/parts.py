@@ -11,7 +11,7 @@ MAX_PARTS = 10_000
 def part_size(size: int, settings: Settings) -> int:
     """Bytes of every part but the last for a file of ``size`` bytes: the settings', more where the parts run out."""
     needed = -(-size // MAX_PARTS)
-    return max(settings.upload_part_bytes, -(-needed // MiB) * MiB)
+    return max(settings.part_bytes, -(-needed // MiB) * MiB)
 
 
 def part_count(size: int, settings: Settings) -> int:
@@ -21,4 +21,4 @@ def part_count(size: int, settings: Settings) -> int:
 
 def largest_part(settings: Settings) -> int:
     """The largest part any upload may have."""
-    return part_size(settings.upload_max_bytes, settings)
+    return part_size(max(settings.max_upload_bytes, settings.max_model_bytes), settings)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Literal
 
-from l3ps_platform.catalog import UploadState
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from l3ps_platform.catalog import UploadState
+
 Kind = Literal["drive", "model"]
-Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Name = Annotated[
+    str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")
+]
 Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
 
 
@@ -21,6 +24,7 @@ class UploadRequest(BaseModel):
     kind: Kind = Field(description="`drive`: an archive of a drive log; `model`: a zipped model bundle.")
     filename: Name = Field(examples=["2026-11-22-morning.tar"])
     size: int = Field(ge=0, description="Bytes.")
+    sha256: Sha256 | None = Field(default=None, description="Of the whole file; may also come at the completion.")
 
 
 class PartUrl(BaseModel):

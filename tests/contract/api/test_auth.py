@@ -1,0 +1,42 @@
+"""With a token in the settings, nothing but health checks, documentation and presigned URLs answers without it."""
+
+import httpx
+import pytest
+
+TOKEN = "a-long-enough-token"
+
+
+@pytest.fixture(scope="module")
+def guarded(api_process, redis_server) -> str:
+    return api_process(token=TOKEN, redis_url=redis_server)
+
+
+@pytest.mark.parametrize(
+    "path", ["/v1/drives", "/v1/jobs", "/v1/models", "/v1/jobs/x/labels", "/v1/uploads/x", "/metrics"]
+)
+@pytest.mark.parametrize("header", [None, "Bearer wrong", f"Basic {TOKEN}", f"Bearer {TOKEN}x", "Bearer ünknown"])
+def test_without_the_token_nothing_is_told(guarded, path, header):
+    headers = {"authorization": header.encode()} if header else {}
+    answer = httpx.get(f"{guarded}{path}", headers=headers)
+    assert answer.status_code == 401
+    assert answer.headers["www-authenticate"] == "Bearer"
+    document = answer.json()
+    assert document["type"] == "urn:l3ps:problem:unauthorized"
+    assert "L3PS_TOKEN" in document["errors"][0]["remedy"]
+
+
+def test_with_the_token_everything_answers(guarded):
+    with httpx.Client(base_url=guarded, headers={"authorization": f"Bearer {TOKEN}"}) as http:
+        assert http.get("/v1/drives").is_success
+        assert http.get("/metrics").is_success
+
+
+def test_health_needs_no_token(guarded):
+    assert httpx.get(f"{guarded}/healthz").is_success
+    assert httpx.get(f"{guarded}/readyz").is_success
+
+
+def test_presigned_urls_carry_their_own_permission(guarded):
+    with httpx.Client(base_url=guarded, headers={"authorization": f"Bearer {TOKEN}"}) as http:
+        upload = http.post("/v1/uploads", json={"kind": "drive", "filename": "log.tar", "size": 3}).json()
+    assert httpx.put(upload["parts"][0]["url"], content=b"abc").is_success

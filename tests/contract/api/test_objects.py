@@ -1,0 +1,94 @@
+"""The presigned URLs of the directory store, which the API answers itself, as S3 would."""
+
+import httpx
+import pytest
+
+from l3ps_platform.objects import DirectoryStore
+
+MiB = 1 << 20
+
+
+@pytest.fixture
+def store(service) -> DirectoryStore:
+    if not isinstance(service.store, DirectoryStore):
+        pytest.skip("this service's presigned URLs lead to its S3 server")
+    return service.store
+
+
+def test_an_object_comes_as_a_download_that_no_browser_renders(store):
+    store.put_bytes("test/page.html", b"<script>alert(1)</script>")
+    answer = httpx.get(store.presign_get("test/page.html", 60, "labels of a.html"))
+    assert answer.content == b"<script>alert(1)</script>"
+    assert answer.headers["content-disposition"].startswith("attachment")
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_a_part_of_an_object_can_be_asked_for(store):
+    store.put_bytes("test/numbers.bin", bytes(range(200)))
+    url = store.presign_get("test/numbers.bin", 60)
+    answer = httpx.get(url, headers={"range": "bytes=10-19"})
+    assert (answer.status_code, answer.content) == (206, bytes(range(10, 20)))
+    head = httpx.head(url)
+    assert (head.status_code, head.headers["content-length"]) == (200, "200")
+
+
+def test_an_expired_url_is_refused(service, store):
+    store.put_bytes("test/old.bin", b"old")
+    document = service.refused(httpx.get(store.presign_get("test/old.bin", -1)), 403, "invalid-signature")
+    assert "expired" in document["detail"]
+
+
+def test_a_url_permits_one_object_one_way(service, store):
+    store.put_bytes("test/mine.bin", b"mine")
+    store.put_bytes("test/yours.bin", b"yours")
+    url = store.presign_get("test/mine.bin", 60)
+    service.refused(httpx.get(url.replace("mine", "yours")), 403, "invalid-signature")
+    service.refused(httpx.put(url, content=b"other"), 403, "invalid-signature")
+    service.refused(httpx.get(url.partition("?")[0]), 403, "invalid-signature")
+    assert store.get_bytes("test/mine.bin") == b"mine"
+
+
+@pytest.mark.parametrize("key", ["../secret", "%2e%2e/secret", "a/..%2f..%2f/secret", "%2fetc/passwd", "a%00b"])
+def test_no_path_leads_out_of_the_store(service, store, key):
+    with httpx.Client() as client:
+        url = httpx.URL(service.url, raw_path=f"/v1/objects/{key}?expires=9999999999&signature=00".encode())
+        answer = client.get(url)
+    assert answer.status_code in (403, 404)
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_missing_object_is_a_404(service, store):
+    service.refused(httpx.get(store.presign_get("test/none.bin", 60)), 404, "unknown-object")
+
+
+@pytest.mark.parametrize("declared", [True, False], ids=["declared", "chunked"])
+def test_a_part_over_the_limit_leaves_nothing(service, store, declared):
+    upload = service.announce(4 * MiB)
+    body = bytes(8 * MiB)
+
+    def chunks():
+        for start in range(0, len(body), MiB):
+            yield body[start : start + MiB]
+
+    before = {path for path in store.root.rglob("*") if path.is_file()}
+    try:
+        answer = httpx.put(upload["parts"][0]["url"], content=body if declared else chunks())
+    except httpx.TransportError:
+        pass  # the server may close the connection before the client has sent everything
+    else:
+        service.refused(answer, 413, "too-large")
+    assert {path for path in store.root.rglob("*") if path.is_file()} == before
+
+
+def test_a_body_that_breaks_off_leaves_nothing(service, store):
+    upload = service.announce(4 * MiB)
+    before = {path for path in store.root.rglob("*") if path.is_file()}
+
+    def broken():
+        yield bytes(MiB)
+        raise ConnectionAbortedError
+
+    with pytest.raises(ConnectionAbortedError):
+        httpx.put(upload["parts"][0]["url"], content=broken(), headers={"content-length": str(4 * MiB)})
+    service.http.get("/healthz")  # the server has noticed by the time it answers again
+    assert {path for path in store.root.rglob("*") if path.is_file()} == before

@@ -1,0 +1,159 @@
+"""``l3ps up`` as a user runs it: it comes up, it goes away whole, and nothing of it stays behind."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+
+
+class Up:
+    """A running ``l3ps up``."""
+
+    def __init__(self, data: Path, *options: str) -> None:
+        command = [sys.executable, "-m", "l3ps_cli.main", "up", "--data", str(data), "--port", "0", *options]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            command, stdout=pipe, stderr=pipe, text=True, env=os.environ | {"COLUMNS": "400"}
+        )
+        self.data = data
+
+    def wait_until_up(self) -> str:
+        line = self.process.stdout.readline()
+        assert line.startswith("l3ps is up at http://127.0.0.1:"), line + self.process.stderr.read()
+        return line.split()[4]
+
+    def descendants(self) -> set[int]:
+        parents = {}
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+        found = {self.process.pid}
+        while more := {pid for pid, parent in parents.items() if parent in found} - found:
+            found |= more
+        return found - {self.process.pid}
+
+    def wait_for_a_worker_child(self) -> set[int]:
+        """All descendants once the worker has forked: Redis, the API, the worker and at least one of its children."""
+        deadline = time.monotonic() + 60
+        while len(found := self.descendants()) < 4:
+            assert time.monotonic() < deadline, found
+            time.sleep(0.05)
+        return found
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=60)
+        return self.process.returncode, out, err
+
+
+@pytest.fixture
+def up(tmp_path):
+    started = []
+
+    def start(*options: str) -> Up:
+        started.append(Up(tmp_path / "data", *options))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.process.kill()
+        each.process.communicate()
+
+
+def alive(pids: set[int]) -> set[int]:
+    """Those of the processes that run, after giving the kernel time to end them."""
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        running = set()
+        for pid in pids:
+            try:
+                if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                    running.add(pid)
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+        if not running:
+            return set()
+        time.sleep(0.05)
+    return running
+
+
+def assert_nothing_left(data: Path, pids: set[int], url: str) -> None:
+    assert alive(pids) == set()
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", int(url.rpartition(":")[2]))) != 0, "somebody still listens"
+    assert [path for path in data.rglob("*") if path.is_socket()] == []
+
+
+def test_up_serves_until_ctrl_c_and_keeps_what_it_was_given(up, tmp_path):
+    first = up()
+    url = first.wait_until_up()
+    info = json.loads((first.data / "up.json").read_text())
+    assert info == {"url": url, "token": None, "pid": first.process.pid}
+    upload = httpx.post(f"{url}/v1/uploads", json={"kind": "drive", "filename": "a.tar", "size": 9}).json()
+
+    second = up()
+    code, _, complaint = second.end()
+    assert code == 1
+    assert f"already up on {first.data}, at {url}" in complaint
+    assert len(complaint.strip().splitlines()) == 1
+    assert httpx.get(f"{url}/readyz").is_success, "the first is not disturbed"
+
+    pids = first.wait_for_a_worker_child()
+    first.process.send_signal(signal.SIGINT)
+    code, out, err = first.end()
+    assert code == 0, err
+    assert "l3ps has stopped." in out
+    assert_nothing_left(first.data, pids, url)
+    assert not (first.data / "up.json").exists()
+
+    again = up("--token", "s3cret")
+    url = again.wait_until_up()
+    path = f"{url}/v1/uploads/{upload['id']}"
+    assert httpx.get(path).status_code == 401
+    assert httpx.get(path, headers={"authorization": "Bearer s3cret"}).json()["state"] == "open"
+    again.process.send_signal(signal.SIGTERM)
+    assert again.end()[0] == 0
+
+
+def test_a_killed_up_leaves_no_process_and_the_next_one_starts(up):
+    first = up()
+    url = first.wait_until_up()
+    pids = first.wait_for_a_worker_child()
+    first.process.kill()
+    first.process.communicate()
+    assert_nothing_left(first.data, pids, url)
+
+    second = up()
+    assert httpx.get(f"{second.wait_until_up()}/readyz").is_success
+
+
+def test_when_a_part_dies_the_rest_is_stopped_and_the_part_named(up):
+    stack = up()
+    url = stack.wait_until_up()
+    pids = stack.wait_for_a_worker_child()
+    redis = next(pid for pid in pids if b"redis-server" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    os.kill(redis, signal.SIGKILL)
+    code, _, err = stack.end()
+    assert code == 1
+    assert "redis stopped by itself (killed by SIGKILL)" in err
+    assert_nothing_left(stack.data, pids, url)
+
+
+def test_a_taken_port_is_said_before_anything_starts(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [sys.executable, "-m", "l3ps_cli.main", "up", "--data", tmp_path / "data", "--port", port]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert f"Port {port} on 127.0.0.1 is taken" in result.stderr
+    assert not (tmp_path / "data" / "logs" / "redis.log").exists()

@@ -1,0 +1,190 @@
+"""What crashes, lost messages and impatient clients leave behind is put right, on both databases and a real Redis."""
+
+import threading
+
+import pytest
+
+from l3ps_platform import workflow
+from l3ps_platform.catalog import (
+    Catalog,
+    DriveState,
+    JobState,
+    QueueName,
+    StageMessage,
+    StageName,
+    StageState,
+    UploadState,
+    drives,
+    uploads,
+)
+from l3ps_platform.errors import QueueUnavailable
+from l3ps_platform.queue import Queue
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import Reconciler, Retry
+
+
+def test_nothing_to_do(tidy, play) -> None:
+    play.submit()
+    assert tidy() == workflow.Report()
+
+
+def test_a_dead_worker_s_stage_is_tried_again_and_the_job_succeeds(tidy, play, sent) -> None:
+    job = play.submit(scenes=1)
+    play.take(lease=-1)
+    assert tidy(retry_seconds=0) == workflow.Report(expired=1, retried=1)
+    assert [(m.name, m.attempt) for m in sent] == [("segment", 2)]
+    assert play.finish_all() == ["segment", "refine", "publish"]
+    assert play.job(job).state is JobState.SUCCEEDED
+
+
+def test_a_stage_that_kills_every_worker_fails_with_a_reason(tidy, play, sent) -> None:
+    job = play.submit(scenes=1)
+    for _ in range(3):
+        play.take(lease=-1)
+        tidy(retry_seconds=0)
+    assert not sent
+    row = play.job(job)
+    assert row.state is JobState.FAILED
+    assert "stopped answering" in row.error["message"]
+
+
+def test_a_live_lease_is_left_alone(tidy, play, sent) -> None:
+    play.submit(scenes=1)
+    claim = play.take(lease=60)
+    assert tidy().expired == 0
+    assert play.stage(claim.stage_id).state is StageState.RUNNING
+
+
+def test_a_dead_worker_of_a_cancelled_job_ends_it(tidy, play, sent) -> None:
+    job = play.submit(scenes=1)
+    play.take(lease=-1)
+    with play.catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    tidy()
+    assert play.job(job).state is JobState.CANCELLED
+
+
+def test_retries_wait_for_their_time(tidy, play, sent) -> None:
+    play.submit(scenes=1)
+    error = {"message": "the store was away", "problems": []}
+    play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=Retry(3, 3600)))
+    assert tidy().retried == 0
+    play.submit(scenes=1)
+    play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=Retry(3, 0)))
+    assert tidy().retried == 1
+    assert [(m.name, m.attempt) for m in sent] == [("segment", 2)]
+
+
+def test_a_lost_message_is_sent_again_but_one_that_waits_is_not(tidy, play, sent) -> None:
+    """Two stages are queued; the queue still holds the message of one of them."""
+    play.submit(scenes=2)
+    waiting, lost = sent
+    sent.clear()
+    tidy.queue.send([waiting])
+    assert tidy(resend_seconds=3600).resent == 0
+    assert tidy(resend_seconds=-1).resent == 1
+    assert sent == [lost]
+
+
+def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
+    with play.catalog.transaction() as tx:
+        drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
+    tidy.store.put_bytes("uploads/u/d.zip", b"archive")
+    for _ in range(3):
+        play.take(lease=-1)
+        tidy(retry_seconds=0)
+    with play.catalog.reading() as session:
+        row = drives.get(session, drive.id)
+    assert row.state is DriveState.REJECTED
+    assert row.problem["problems"][0]["code"] == "not-checked"
+    assert row.object_key is None
+    assert not tidy.store.exists("uploads/u/d.zip")
+
+
+def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -> None:
+    rejected, deleted, kept = play.drive(usable=False), play.drive(), play.drive()
+    for drive, key in ((rejected, "a/1"), (deleted, "a/2"), (kept, "a/3")):
+        tidy.store.put_bytes(key, b"archive")
+        with play.catalog.transaction() as tx:
+            drives.lock(tx.session, drive).object_key = key
+    with play.catalog.transaction() as tx:
+        drives.delete(tx, deleted)
+    assert tidy().archives == 2
+    assert [info.key for info in tidy.store.list()] == ["a/3"]
+    assert tidy().archives == 0
+
+
+def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
+    """Their parts leave the store; a fresh one stays."""
+    made = {}
+    for name, seconds in (("old", -1), ("new", 3600)):
+        upload_id = tidy.store.create_multipart(f"u/{name}")
+        with catalog.transaction() as tx:
+            row = uploads.add(
+                tx,
+                kind="drive",
+                filename=f"{name}.zip",
+                size=1,
+                parts=1,
+                object_key=f"u/{name}",
+                s3_upload_id=upload_id,
+                seconds=seconds,
+            )
+        made[name] = (row.id, upload_id)
+    assert tidy().uploads == 1
+    with catalog.reading() as session:
+        assert uploads.get(session, made["old"][0]).state is UploadState.ABORTED
+        assert uploads.get(session, made["new"][0]).state is UploadState.OPEN
+    assert [p.name for p in (tidy.store.root / "multipart").iterdir()] == [made["new"][1]]
+
+
+def test_two_reconcilers_at_once_send_one_message(tidy, play, sent) -> None:
+    play.submit(scenes=10)
+    for _ in range(10):
+        play.take(lease=-1)
+    barrier = threading.Barrier(3)
+
+    def sweep() -> None:
+        barrier.wait()
+        tidy(retry_seconds=0)
+
+    threads = [threading.Thread(target=sweep) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(m.attempt for m in sent) == [2] * 10
+    assert len({m.stage_id for m in sent}) == 10
+
+
+def test_a_worker_s_main_process_reports_its_dead_child(play, sent) -> None:
+    """At once instead of after the lease, and only for stages of its own children."""
+    play.submit(scenes=1)
+    message = sent[0]
+    claim = play.take(owner="host:100:101")
+    retry = Retry(3, 5)
+    with play.catalog.transaction() as tx:
+        assert not workflow.lease_lost(tx, message.stage_id, retry, owner_prefix="host:999:")
+        assert workflow.lease_lost(tx, message.stage_id, retry, owner_prefix="host:100:", reason="killed for memory")
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.attempt, stage.error["message"]) == (StageState.WAITING, 2, "killed for memory")
+
+
+def test_a_dead_redis_is_said_so_and_the_row_stays_queued(catalog: Catalog, play) -> None:
+    queue = Queue(Settings(redis_url="redis://127.0.0.1:1/0"))
+    message = StageMessage("stg_x", 1, StageName.SEGMENT, QueueName.SEGMENT)
+    for call in (queue.ping, queue.depth, lambda: queue.send([message])):
+        with pytest.raises(QueueUnavailable, match="does not answer"):
+            call()
+    offline = Catalog(catalog.url, queue.send)
+    drive, model = play.drive(1), play.model()
+    with offline.transaction() as tx:
+        job = workflow.submit_job(tx, drive_id=drive, model=model)
+    offline.dispose()
+    assert play.states(job.id)[0] == ("segment", "queued")
+
+
+def test_the_loop_stops_when_told(tidy, catalog: Catalog) -> None:
+    stop = threading.Event()
+    stop.set()
+    Reconciler(catalog, tidy.queue, tidy.store, tidy.settings).run(stop)

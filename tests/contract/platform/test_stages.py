@@ -1,0 +1,284 @@
+"""Who owns a stage, on SQLite and PostgreSQL: the rules that make lost and repeated messages harmless."""
+
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from l3ps.errors import Cancelled
+from l3ps_platform import workflow
+from l3ps_platform.catalog import Catalog, JobState, StageMessage, StageState
+from l3ps_platform.errors import LeaseLost
+from l3ps_platform.workflow import Retry
+
+RETRY = Retry(max_attempts=3, seconds=5.0)
+ERROR = {"message": "it broke", "problems": []}
+
+
+def test_a_job_runs_from_first_message_to_last(play, sent) -> None:
+    job = play.submit(scenes=2)
+    assert play.job(job).state is JobState.QUEUED
+    assert play.finish_all() == ["segment", "segment", "refine", "refine", "publish"]
+    row = play.job(job)
+    assert row.state is JobState.SUCCEEDED
+    assert row.quality == {"of": "publish"}
+    assert row.started_at <= row.finished_at
+    assert {state for _, state in play.states(job)} == {"done"}
+
+
+def test_a_message_delivered_twice_is_claimed_once(play, sent) -> None:
+    play.submit(scenes=1)
+    message = sent[0]
+    assert play.take(message) is not None
+    assert play.take(message, owner="worker-2") is None
+
+
+def test_a_message_delivered_after_its_stage_is_done_does_nothing(play, sent) -> None:
+    job = play.submit(scenes=1)
+    first = sent[0]
+    play.finish_all()
+    before = play.states(job)
+    assert play.take(first) is None
+    assert play.states(job) == before
+
+
+def test_messages_for_unknown_stages_are_dropped(play, sent) -> None:
+    play.submit(scenes=1)
+    assert play.take(StageMessage("stg_none", 1, sent[0].name, sent[0].queue)) is None
+    assert play.take(StageMessage(sent[0].stage_id, 7, sent[0].name, sent[0].queue)) is None
+
+
+def test_many_claimers_at_once_get_each_stage_once(catalog: Catalog, play, sent) -> None:
+    """Eight threads race for 20 stages, every one of them trying all."""
+    play.submit(scenes=20)
+    messages, won, barrier = list(sent), [], threading.Barrier(8)
+
+    def race(owner: str) -> None:
+        barrier.wait()
+        for message in messages:
+            claim = play.take(message, owner=owner)
+            if claim is not None:
+                won.append((claim.stage_id, owner))
+
+    threads = [threading.Thread(target=race, args=(f"worker-{n}",)) for n in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(stage for stage, _ in won) == sorted(m.stage_id for m in messages)
+    assert all(play.stage(stage).lease_owner == owner for stage, owner in won)
+
+
+def test_scenes_finishing_at_once_publish_once(catalog: Catalog, play, sent) -> None:
+    """Under PostgreSQL each of two transactions sees the other's scene still running unless the job is locked."""
+    job = play.submit(scenes=6)
+    while sent and sent[0].name == "segment":
+        play.run(lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(1.0)))
+    claims = [play.take() for _ in range(6)]
+    barrier = threading.Barrier(6)
+
+    def finish(claim: workflow.Claim) -> None:
+        barrier.wait()
+        with catalog.transaction() as tx:
+            workflow.complete(tx, claim, workflow.Cost(1.0))
+
+    threads = [threading.Thread(target=finish, args=(claim,)) for claim in claims]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [message.name for message in sent] == ["publish"]
+    play.finish_all()
+    assert play.job(job).state is JobState.SUCCEEDED
+
+
+def test_an_expired_lease_is_taken_over_as_the_next_attempt(play, sent) -> None:
+    """A message redelivered after its worker died: the first owner may not write any more."""
+    play.submit(scenes=1)
+    message = sent[0]
+    dead = play.take(message, owner="dead", lease=-1)
+    claim = play.take(message, owner="alive")
+    assert (claim.attempt, play.stage(claim.stage_id).lease_owner) == (2, "alive")
+    for write in (
+        lambda tx: workflow.heartbeat(tx, dead),
+        lambda tx: workflow.report(tx, dead, "x", 1, 2, fraction=0.5),
+        lambda tx: workflow.complete(tx, dead, workflow.Cost(1.0)),
+        lambda tx: workflow.fail(tx, dead, ERROR, retry=RETRY),
+        lambda tx: workflow.cancelled(tx, dead),
+        lambda tx: workflow.release(tx, dead),
+    ):
+        with pytest.raises(LeaseLost), play.catalog.transaction() as tx:
+            write(tx)
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.attempt, stage.lease_owner) == (StageState.RUNNING, 2, "alive")
+
+
+def test_a_stage_that_kills_its_workers_is_not_taken_over_for_ever(play, sent) -> None:
+    play.submit(scenes=1)
+    message = sent[0]
+    for attempt in (1, 2, 3):
+        claim = play.take(StageMessage(message.stage_id, max(attempt - 1, 1), message.name, message.queue), lease=-1)
+        assert claim.attempt == attempt
+    assert play.take(StageMessage(message.stage_id, 3, message.name, message.queue)) is None
+
+
+def test_heartbeats_keep_a_stage(play, sent) -> None:
+    play.submit(scenes=1)
+    message = sent[0]
+    claim = play.take(message, lease=-1)
+    alive = workflow.Claim(claim.stage_id, claim.attempt, claim.owner, claim.name, 60.0, claim.job_id)
+    with play.catalog.transaction() as tx:
+        workflow.heartbeat(tx, alive)
+    assert play.take(message, owner="worker-2") is None
+
+
+def test_progress_is_seen(play, sent) -> None:
+    play.submit(scenes=1)
+    claim = play.take()
+    with play.catalog.transaction() as tx:
+        workflow.report(tx, claim, "accumulate", 3, 20, fraction=0.15)
+    stage = play.stage(claim.stage_id)
+    assert (stage.progress_step, stage.progress_done, stage.progress_total, stage.fraction) == (
+        "accumulate",
+        3,
+        20,
+        0.15,
+    )
+
+
+def test_a_failure_is_tried_again_later_and_longer_each_time(play, sent) -> None:
+    play.submit(scenes=1)
+    message, waits = sent.pop(0), []
+    for attempt in (1, 2):
+        claim = play.take(StageMessage(message.stage_id, attempt, message.name, message.queue))
+        with play.catalog.transaction() as tx:
+            workflow.fail(tx, claim, ERROR, retry=RETRY)
+            waits.append((tx.session.get(type(play.stage(claim.stage_id)), claim.stage_id).not_before - tx.now).seconds)
+            workflow.planning.enqueue(tx, tx.session.get(type(play.stage(claim.stage_id)), claim.stage_id))
+    assert waits == [5, 10]
+    play.run(lambda tx, claim: workflow.fail(tx, claim, ERROR, retry=RETRY), sent[-1])
+    stage = play.stage(message.stage_id)
+    assert (stage.state, stage.attempt, stage.error) == (StageState.FAILED, 3, ERROR)
+
+
+def test_a_failed_scene_lets_the_others_finish(play, sent) -> None:
+    job = play.submit(scenes=2)
+    play.run(lambda tx, claim: workflow.fail(tx, claim, ERROR))
+    assert play.finish_all() == ["segment", "refine", "publish"]
+    row = play.job(job)
+    assert row.state is JobState.FAILED
+    assert row.error["message"] == "1 of 2 scenes failed: scene-0: it broke"
+    assert row.quality == {"of": "publish"}
+    assert play.states(job)[:2] == [("segment", "failed"), ("refine", "cancelled")]
+
+
+def test_a_job_whose_scenes_all_failed_publishes_nothing(play, sent) -> None:
+    job = play.submit(scenes=2)
+    for _ in range(2):
+        play.run(lambda tx, claim: workflow.fail(tx, claim, ERROR))
+    assert not sent
+    assert play.job(job).state is JobState.FAILED
+    assert play.states(job)[-1] == ("publish", "cancelled")
+
+
+def test_a_publish_that_fails_fails_the_job(play, sent) -> None:
+    job = play.submit(scenes=1)
+    play.run(lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(1.0)))
+    play.run(lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(1.0)))
+    play.run(lambda tx, claim: workflow.fail(tx, claim, ERROR))
+    row = play.job(job)
+    assert (row.state, row.error["message"]) == (
+        JobState.FAILED,
+        "the results could not be published: publish: it broke",
+    )
+
+
+def test_a_worker_that_stops_gives_its_stage_back(play, sent) -> None:
+    """No attempt is counted, and the next worker gets a message at once."""
+    job = play.submit(scenes=1)
+    play.run(workflow.release)
+    assert (sent[0].name, sent[0].attempt) == ("segment", 1)
+    play.finish_all()
+    assert play.job(job).state is JobState.SUCCEEDED
+
+
+class TestCancel:
+    def test_before_anything_ran(self, play, sent) -> None:
+        job = play.submit(scenes=2)
+        with play.catalog.transaction() as tx:
+            workflow.cancel_job(tx, job)
+        assert play.job(job).state is JobState.CANCELLED
+        assert {state for _, state in play.states(job)} == {"cancelled"}
+        assert all(play.take(message) is None for message in sent)
+
+    def test_a_running_stage_learns_of_it_at_its_next_report(self, play, sent) -> None:
+        job = play.submit(scenes=2)
+        claim = play.take()
+        with play.catalog.transaction() as tx:
+            workflow.cancel_job(tx, job)
+        assert play.job(job).state is JobState.RUNNING
+        with pytest.raises(Cancelled), play.catalog.transaction() as tx:
+            workflow.report(tx, claim, "segment", 1, 6, fraction=0.2)
+        with play.catalog.transaction() as tx:
+            workflow.cancelled(tx, claim)
+        assert play.job(job).state is JobState.CANCELLED
+        assert play.job(job).finished_at is not None
+
+    @pytest.mark.parametrize(
+        "end",
+        [
+            lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(1.0)),
+            lambda tx, claim: workflow.fail(tx, claim, ERROR, retry=RETRY),
+            workflow.release,
+        ],
+        ids=["done", "failed", "released"],
+    )
+    def test_however_the_running_stage_ends_the_job_is_cancelled(self, play, sent, end: Callable) -> None:
+        job = play.submit(scenes=1)
+        claim = play.take()
+        with play.catalog.transaction() as tx:
+            workflow.cancel_job(tx, job)
+        with play.catalog.transaction() as tx:
+            end(tx, claim)
+        assert play.job(job).state is JobState.CANCELLED
+        assert not sent
+
+    def test_a_finished_job_stays_as_it_is(self, play, sent) -> None:
+        job = play.submit(scenes=1)
+        play.finish_all()
+        with play.catalog.transaction() as tx:
+            workflow.cancel_job(tx, job)
+        assert play.job(job).state is JobState.SUCCEEDED
+
+    def test_cancel_races_with_claims_without_deadlock(self, play, sent) -> None:
+        """Claims hold stage rows and want the job's, cancel the other way round, unless they agree on an order."""
+        job = play.submit(scenes=12)
+        messages, barrier, errors = list(sent), threading.Barrier(4), []
+
+        def guarded(action: Callable[[], None]) -> None:
+            barrier.wait()
+            try:
+                action()
+            except Exception as error:
+                errors.append(error)
+
+        def claim_all(owner: str) -> None:
+            for message in messages:
+                claim = play.take(message, owner=owner)
+                if claim is not None:
+                    with play.catalog.transaction() as tx:
+                        workflow.complete(tx, claim, workflow.Cost(1.0))
+
+        def cancel() -> None:
+            with play.catalog.transaction() as tx:
+                workflow.cancel_job(tx, job)
+
+        actions = [lambda n=n: claim_all(f"worker-{n}") for n in range(3)] + [cancel]
+        threads = [threading.Thread(target=guarded, args=(action,)) for action in actions]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert not errors
+        assert play.job(job).state is JobState.CANCELLED
+        assert {state for _, state in play.states(job)} <= {"cancelled", "done"}
