@@ -21,7 +21,7 @@ from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
 from l3ps_api.models.routes import router as models
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.services import Services
-from l3ps_api.system.routes import health_router, metrics_router
+from l3ps_api.system.routes import router as system
 from l3ps_api.uploads.routes import router as uploads
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
@@ -58,8 +58,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings))
     guarded = [Depends(require_token)]
-    app.include_router(health_router)
-    app.include_router(metrics_router, dependencies=guarded)
+    app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
     for router in (uploads, drives, jobs, labels, models):
         app.include_router(router, dependencies=guarded)

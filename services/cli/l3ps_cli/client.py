@@ -175,7 +175,7 @@ class Client:
             except httpx.TransportError as error:
                 if attempt == _TRIES or not (repeat or isinstance(error, httpx.ConnectError)):
                     raise ServiceUnreachableError(self._unreachable(error)) from error
-                time.sleep(0.25 * 2**attempt)
+                time.sleep(0.1 * 2**attempt)
                 continue
             if answer.status_code in _BUSY and attempt < _TRIES:
                 time.sleep(min(float(answer.headers.get("retry-after", "1")), 5.0))
