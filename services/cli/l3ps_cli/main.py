@@ -29,7 +29,9 @@ class _OnDemand(TyperGroup):
             return None
         module = import_module(f"l3ps_cli.{cmd_name}")
         if hasattr(module, "app"):
-            return typer.main.get_group(module.app)
+            group = typer.main.get_group(module.app)
+            group.name = cmd_name
+            return group
         alone = typer.Typer(add_completion=False)
         alone.command(cmd_name)(getattr(module, cmd_name))
         return typer.main.get_command(alone)
