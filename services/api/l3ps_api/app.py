@@ -56,7 +56,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.services = services
     app.state.token = settings.token.get_secret_value() if settings.token else None
     app.state.registry = CollectorRegistry()
-    app.state.registry.register(CatalogCollector(catalog, queue, settings))
+    app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     guarded = [Depends(require_token)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
