@@ -65,8 +65,11 @@ def create_app(settings: Settings) -> FastAPI:
     errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(BodyLimit, exempt="/v1/objects/")
-    if settings.host in ("127.0.0.1", "localhost", "::1") and not settings.public_url:
+    loopback = settings.host in ("127.0.0.1", "localhost", "::1")
+    if loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
+    if not loopback and app.state.token is None:
+        log.warning("anyone who reaches this address may use the service: set L3PS_TOKEN", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     problems.describe_in_openapi(app)
     return app
