@@ -55,7 +55,7 @@ _REMEDY: Final = {
     "truncated-archive": "Pack or upload it again; the copy is not complete",
     "corrupt-archive": "Pack or upload it again; the copy is damaged",
     "encrypted-archive": "Pack the log without a password",
-    "unknown-compression": "Pack the log as an ordinary .zip, or as .tar.gz",
+    "unknown-compression": "Pack the log as an ordinary .zip, as .tar.gz, or as .tar.zst without --long",
     "unsafe-path": "Pack the log's folder with plain relative names",
     "duplicate-path": "Pack every file once",
     "archive-link": "Pack the files themselves instead of links to them (tar: --dereference --hard-dereference)",
@@ -223,6 +223,9 @@ def _translated(read: Callable[[int], bytes], errors: tuple[type[Exception], ...
         except EOFError as error:
             raise ArchiveFault("truncated-archive", "it is truncated: the compressed data ends too early") from error
         except errors as error:
+            if "too much memory" in str(error):
+                what = f"its zstd window is larger than {_ZSTD_WINDOW >> 20} MB"
+                raise ArchiveFault("unknown-compression", what) from error
             raise ArchiveFault("corrupt-archive", f"it is corrupt ({error})") from error
 
     return translating

@@ -124,8 +124,8 @@ class _SceneCheck:
         seen = []
         for camera in scan.cameras:
             size = self._image(scan, camera)
-            if size is None or sample is None:
-                continue
+            if size is None or sample is None or size != (camera.size or size):
+                continue  # an image of another size has a problem of its own, and tells nothing about calibration
             inside = _any_inside(sample, scan, camera, size)
             self.projected[camera.channel] += 1
             self.hits[camera.channel] += inside

@@ -5,6 +5,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +129,11 @@ def nuscenes_log(tmp_path: Path) -> Callable[..., NuScenesLog]:
                         token = f"{channel}-{s}-{i}-{sweep}"
                         pose = f"p-{token}"
                         t["ego_pose"].append(
-                            {"token": pose, "translation": [(at - stamp) * 1e-5 + 5.0 * i, 0, 0], "rotation": [1, 0, 0, 0]}
+                            {
+                                "token": pose,
+                                "translation": [(at - stamp) * 1e-5 + 5.0 * i, 0, 0],
+                                "rotation": [1, 0, 0, 0],
+                            }
                         )
                         folder = "sweeps" if sweep else "samples"
                         name = f"{folder}/{channel}/{token}" + (".pcd.bin" if lidar else ".png")
@@ -151,7 +156,7 @@ def nuscenes_log(tmp_path: Path) -> Callable[..., NuScenesLog]:
                             log.write(name, cloud(100 * s + 10 * i + sweep, 5).tobytes())
                         elif channel in cameras:
                             log.write(name, png())
-            for before, after in zip(lidar_chain, lidar_chain[1:], strict=False):
+            for before, after in pairwise(lidar_chain):
                 before["next"], after["prev"] = after["token"], before["token"]
         log.save()
         return log
@@ -181,7 +186,10 @@ def kitti_raw_log(tmp_path: Path) -> Callable[..., Path]:
         _write(day / "calib_velo_to_cam.txt", f"calib_time: 15-Mar-2012 11:37:16\nR: {r}\nT: {t}\n")
         lines = ["calib_time: 09-Jan-2012 13:57:47", "R_rect_00: 1 0 0 0 1 0 0 0 1"]
         for number in ("00", "01", "02", "03"):
-            lines += [f"S_rect_{number}: {WIDTH} {HEIGHT}", f"P_rect_{number}: {KITTI_P.format(-int(number) * FOCAL * 0.5)}"]
+            lines += [
+                f"S_rect_{number}: {WIDTH} {HEIGHT}",
+                f"P_rect_{number}: {KITTI_P.format(-int(number) * FOCAL * 0.5)}",
+            ]
         _write(day / "calib_cam_to_cam.txt", "\n".join(lines) + "\n")
         for d in range(drives):
             drive = day / f"2011_09_26_drive_{d:04d}_sync"

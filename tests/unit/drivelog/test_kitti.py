@@ -41,7 +41,9 @@ def test_raw_projection_is_p_r_t(kitti_raw_log):
 
 
 def test_colour_is_preferred_and_grey_taken_where_there_is_no_colour(kitti_raw_log, semantickitti_log):
-    assert [c.channel for c in open_drive(kitti_raw_log(cameras=("00", "03"))).scenes[0].scans[0].cameras] == ["image_03"]
+    assert [c.channel for c in open_drive(kitti_raw_log(cameras=("00", "03"))).scenes[0].scans[0].cameras] == [
+        "image_03"
+    ]
     grey = open_drive(semantickitti_log(cameras=(0, 1))).scenes[0].scans[0].cameras
     assert [c.channel for c in grey] == ["image_0", "image_1"]
 

@@ -249,7 +249,8 @@ def test_nonsense_in_one_camera_calibration_costs_that_camera(nuscenes_log, colu
 
 
 @pytest.mark.parametrize(
-    "intrinsic", [[], None, [[1, 2], [3, 4]], [[0, 0, 1], [0, 1, 1], [0, 0, 1]], [[1, 0, 1], [0, math.nan, 1], [0, 0, 1]]]
+    "intrinsic",
+    [[], None, [[1, 2], [3, 4]], [[0, 0, 1], [0, 1, 1], [0, 0, 1]], [[1, 0, 1], [0, math.nan, 1], [0, 0, 1]]],
 )
 def test_camera_without_a_usable_intrinsic(nuscenes_log, intrinsic):
     log = nuscenes_log()
