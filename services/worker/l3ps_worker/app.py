@@ -1,4 +1,147 @@
-from l3ps_platform.queue import make_app
+"""The worker: ``celery -A l3ps_worker.app worker -Q segment,refine -c N``."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
 from l3ps_platform.settings import get_settings
 
-app = make_app(get_settings())
+settings = get_settings()
+# Numeric libraries read these when they are first imported, which happens below.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
+    os.environ.setdefault(_name, str(settings.threads))
+
+import cv2  # noqa: E402
+import structlog  # noqa: E402
+from billiard.exceptions import TimeLimitExceeded, WorkerLostError  # noqa: E402
+from celery import signals  # noqa: E402
+
+from l3ps_platform import workflow  # noqa: E402
+from l3ps_platform.catalog import Catalog, stages  # noqa: E402
+from l3ps_platform.errors import PlatformError  # noqa: E402
+from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
+from l3ps_platform.telemetry import configure_logging  # noqa: E402
+from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
+from l3ps_worker.runner import run_stage  # noqa: E402
+
+log = structlog.get_logger(__name__)
+
+_PR_SET_PDEATHSIG = 1
+
+app = make_app(settings)
+app.conf.worker_concurrency = settings.concurrency
+
+_stopping = StopFlag()  # made before the fork, so that the children share it
+_main_pid = os.getpid()
+_context: Context | None = None
+
+
+def context() -> Context:
+    """This process' context; never inherited through a fork, because connections and sessions do not survive one."""
+    global _context  # noqa: PLW0603  (one per process by design)
+    if _context is None:
+        _context = Context(settings, _stopping, _main_pid)
+    return _context
+
+
+def _run(stage_id: str, attempt: int) -> None:
+    """The body of every task."""
+    try:
+        run_stage(context(), stage_id, attempt)
+    except PlatformError as error:
+        # The catalog is away. The message is spent; the reconciler sends another when the row still says queued.
+        log.warning("stage not recorded", stage=stage_id, reason=str(error))
+
+
+for _task_name in TASK_NAMES.values():
+    app.task(name=_task_name)(_run)
+
+
+@signals.setup_logging.connect  # type: ignore[untyped-decorator]
+def _configure_logging(**_: Any) -> None:
+    configure_logging(settings, "worker")
+
+
+@signals.worker_process_init.connect  # type: ignore[untyped-decorator]
+def _after_fork(**_: Any) -> None:
+    global _context  # noqa: PLW0603
+    _context = None
+    _die_with(_main_pid)
+    cv2.setNumThreads(settings.threads)
+
+
+@signals.worker_shutting_down.connect  # type: ignore[untyped-decorator]
+def _give_back(**_: Any) -> None:
+    """A stage may take minutes; a worker that is told to stop should not."""
+    _stopping.set()
+
+
+@signals.task_failure.connect  # type: ignore[untyped-decorator]
+def _child_lost(args: Any = None, exception: BaseException | None = None, **_: Any) -> None:
+    """In the main process: a child was killed, by the kernel for memory or by the time limit.
+
+    Its lease would run out anyway; saying so now saves the wait and gives the reason.
+    """
+    if not isinstance(exception, WorkerLostError | TimeLimitExceeded) or not args:
+        return
+    if isinstance(exception, TimeLimitExceeded):
+        reason = f"it ran for more than {settings.stage_seconds:.0f} s and was stopped"
+    else:
+        reason = "its worker process was killed, most likely for using too much memory"
+    log.warning("child lost", stage=args[0], reason=reason)
+    retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
+    with _briefly() as tx:
+        workflow.lease_lost(tx, args[0], retry, owner_prefix=owner_prefix(_main_pid), reason=reason)
+
+
+@signals.worker_init.connect  # type: ignore[untyped-decorator]
+def _bury_predecessors(**_: Any) -> None:
+    """In the main process at its start: what a worker held that was killed on this machine is free at once."""
+    retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
+    with _briefly() as tx:
+        for stage_id, owner in stages.owned(tx.session, f"{socket.gethostname()}:"):
+            pid = owner.split(":")[-2]
+            if int(pid) == _main_pid or not Path("/proc", pid).exists():
+                workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner)
+
+
+@signals.worker_shutdown.connect  # type: ignore[untyped-decorator]
+def _give_back_rest(**_: Any) -> None:
+    """In the main process at its end: what a child held that was killed in mid-stage by our own shutdown."""
+    with _briefly() as tx:
+        workflow.release_owned(tx, owner_prefix(_main_pid))
+
+
+@contextmanager
+def _briefly() -> Iterator[workflow.Transaction]:
+    """A transaction of the main process, on connections that no child may inherit: opened and closed again at once.
+
+    A catalog that is away is logged only: leases run out.
+    """
+    queue = Queue(settings)
+    catalog = Catalog(settings.catalog_url, queue.send)
+    try:
+        with catalog.transaction() as tx:
+            yield tx
+    except PlatformError as error:
+        log.warning("leases will run out", reason=str(error))
+    finally:
+        catalog.dispose()
+        queue.close()
+
+
+def _die_with(parent: int) -> None:
+    """Have the kernel kill this process when the worker's main process is gone, however it went (Linux)."""
+    if sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:  # it went before we asked
+        os._exit(1)

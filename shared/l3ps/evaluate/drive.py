@@ -14,7 +14,7 @@ from l3ps.errors import LabelError, Problem
 from l3ps.evaluate.evaluator import PanopticEvaluator
 from l3ps.evaluate.protocols import Protocol, protocol_named
 from l3ps.evaluate.quality import Quality
-from l3ps.labels.reader import LabelFolder, open_labels
+from l3ps.labels.reader import LabelFolder, open_labels, wrong_count
 from l3ps.labels.spaces import convert
 from l3ps.labels.types import ScanLabels
 from l3ps.progress import Progress, silent
@@ -27,6 +27,8 @@ def evaluate_drive(
     protocol: str,
     scene: str | None = None,
     progress: Progress = silent,
+    *,
+    skip_missing: bool = False,
 ) -> Quality:
     """Score label files against a log's truth.
 
@@ -40,6 +42,8 @@ def evaluate_drive(
         protocol: ``nuscenes``, ``paper`` or ``semantickitti``.
         scene: limit the evaluation to the scene of this name.
         progress: told each scan under the stage name ``evaluate``.
+        skip_missing: leave out scans without a label file (as of a log whose bad scans were skipped) instead of
+            refusing; ``Quality.scans`` tells how many are left.
 
     Raises:
         LabelError: no truth, an unknown scene, a protocol the truth cannot serve, label files that are missing
@@ -51,8 +55,9 @@ def evaluate_drive(
     folder = labels if isinstance(labels, LabelFolder) else open_labels(labels)
     scans = [(s, scan) for s in scenes for scan in s.scans if scan.load_truth is not None]
     missing = [folder.missing(s, scan) for s, scan in scans if folder.find(s, scan) is None]
-    if missing:
+    if missing and (len(missing) == len(scans) or not skip_missing):
         raise LabelError(missing)
+    scans = [(s, scan) for s, scan in scans if folder.find(s, scan) is not None] if missing else scans
     evaluator = PanopticEvaluator(protocol)
     for done, (s, scan) in enumerate(scans, 1):
         truth = _truth_in(drive, rules, scan)
@@ -107,15 +112,7 @@ def _add(
 ) -> None:
     """Count one scan, after making sure that labels and truth are of the same points."""
     if len(semantic) != len(truth.semantic):
-        raise LabelError(
-            Problem(
-                code="label-count",
-                where=f"labels of scan {scan.token}",
-                what=f"have {len(semantic):,} values but the scan has {len(truth.semantic):,} points",
-                remedy="Were they made from another log? Label this one, or name the log they were made from.",
-                scan=scan.token,
-            )
-        )
+        raise wrong_count(scan, len(semantic), len(truth.semantic))
     evaluator.add(truth, semantic, instance)
 
 

@@ -82,7 +82,7 @@ class PanopticEvaluator:
         pred_id, pred_of = np.unique(pairs % span, return_inverse=True)
         truth_class, pred_class = truth_id // truth_base, pred_id // pred_base
 
-        # Whether a class is in the means must not depend on what was predicted: count before dropping predicted void.
+        # A class the prediction abstains from must stay in the means: count before dropping predicted void.
         self.scans += 1
         large = _areas(truth_of, size, len(truth_id)) >= self.protocol.min_points
         self.truth_segments += np.bincount(truth_class[large], minlength=n_classes)
@@ -119,7 +119,7 @@ class PanopticEvaluator:
         missed = truth_area >= self.protocol.min_points
         missed[truth_of[hit]] = False
         self.fn += np.bincount(truth_class[missed], minlength=n_classes)
-        wrong = (pred_area >= self.protocol.min_points) & (pred_class != 0)
+        wrong = pred_area >= self.protocol.min_points
         wrong[pred_of[hit]] = False
         self.fp += np.bincount(pred_class[wrong], minlength=n_classes)
 

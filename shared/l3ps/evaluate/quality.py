@@ -119,6 +119,7 @@ class Quality:
                     "fp": c.fp,
                     "fn": c.fn,
                     "truth_segments": c.truth_segments,
+                    "counted": c.counted,
                 }
                 for name, c in self.classes.items()
             },

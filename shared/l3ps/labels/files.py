@@ -7,9 +7,8 @@ import re
 import tempfile
 from pathlib import Path
 
+from l3ps.drivelog.names import is_plain_name
 from l3ps.errors import LabelError, Problem
-
-_SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
 
 
 def file_stem(token: str) -> str:
@@ -20,13 +19,13 @@ def file_stem(token: str) -> str:
     Raises:
         LabelError: the token is no plain file name.
     """
-    if not _SAFE_NAME.fullmatch(token):
+    if not is_plain_name(token):
         raise LabelError(
             Problem(
                 code="unsafe-token",
                 where=f"scan {token!r}",
                 what="its token cannot be a file name",
-                remedy="Use letters, digits, '_', '-', '+' and '.' in the log's tokens, 200 at most.",
+                remedy="Use letters, digits, '_', '-', '+' and '.' in the log's tokens, 128 at most.",
                 scan=token,
             )
         )
@@ -35,7 +34,9 @@ def file_stem(token: str) -> str:
 
 def folder_name(scene: str) -> str:
     """The scene's name as a folder: what cannot stand in a path becomes ``_``; ``00`` where nothing is left."""
-    return re.sub(r"[^A-Za-z0-9_.+-]+", "_", scene).lstrip(".")[:200] or "00"
+    if is_plain_name(scene):
+        return scene
+    return re.sub(r"[^\w.+-]+", "_", scene).strip(".")[:128].rstrip(".") or "00"
 
 
 def write_whole(path: Path, content: bytes) -> Path:

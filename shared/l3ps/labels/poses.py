@@ -1,7 +1,8 @@
 """Where the LiDAR was at each scan, in the text format of KITTI odometry.
 
 ``poses.txt`` has one row a scan: the 12 numbers of the upper three rows of the transform lidar → scene, row by row,
-metres, the scene's frame being that of its first scan. ``scans.txt`` names scene and token in the same order.
+metres, the scene's frame being that of its first scan. ``scans.txt`` names scene and token in the same order,
+with a tab between, as either may contain spaces.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def write_poses(out: Path, scenes_with_poses: Iterable[tuple[Scene, NDArray[np.f
             )
         for scan, pose in zip(scene.scans, poses, strict=True):
             rows.append(" ".join(f"{value:.12g}" for value in pose[:3].ravel()))
-            names.append(f"{scene.name} {scan.token}")
+            names.append(f"{scene.name}\t{scan.token}")
     return [
         write_whole(out / POSES, "".join(f"{row}\n" for row in rows).encode()),
         write_whole(out / SCANS, "".join(f"{name}\n" for name in names).encode()),
@@ -71,7 +72,7 @@ def read_poses(out: Path) -> dict[str, NDArray[np.float64]]:
             upper = np.asarray([float(value) for value in row.split()], dtype=np.float64).reshape(3, 4)
         except ValueError as error:
             raise _bad(out, f"has no 12 numbers in row {number}") from error
-        poses[name.rpartition(" ")[2]] = np.vstack((upper, (0.0, 0.0, 0.0, 1.0)))
+        poses[name.rpartition("\t")[2]] = np.vstack((upper, (0.0, 0.0, 0.0, 1.0)))
     return poses
 
 

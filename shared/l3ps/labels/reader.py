@@ -33,7 +33,7 @@ class LabelFolder:
         root: the folder.
         format: the format its files are in.
         suffix: what its files' names end in.
-        files: file by scan token and, in the sequence layout, by (sequence folder, token) too.
+        files: file by name and, in the sequence layout, by (sequence folder, name) too.
     """
 
     root: Path
@@ -48,8 +48,14 @@ class LabelFolder:
 
     def find(self, scene: Scene, scan: Scan) -> Path | None:
         """The label file of a scan, or None."""
-        stem = file_stem(scan.token)
-        return self.files.get((folder_name(scene.name), stem)) or self.files.get(stem)
+        name = self._name(scan)
+        return self.files.get((folder_name(scene.name), name)) or self.files.get(name)
+
+    def _name(self, scan: Scan) -> str:
+        """How the scan's file is called."""
+        if self.suffix == semantickitti.SUFFIX:
+            return semantickitti.file_name(scan)
+        return f"{file_stem(scan.token)}{self.suffix}"
 
     def read(
         self, scene: Scene, scan: Scan, space: str = NUSCENES16.name
@@ -84,7 +90,7 @@ class LabelFolder:
         return Problem(
             code="missing-labels",
             where=str(self.root),
-            what=f"has no {scan.token}{self.suffix} for scan {scan.index} of scene {scene.name}",
+            what=f"has no {self._name(scan)} for scan {scan.index} of scene {scene.name}",
             remedy="Name the folder that was made from this log, or label the log again.",
             scene=scene.name,
             scan=scan.token,
@@ -119,25 +125,24 @@ def open_labels(path: Path, format: LabelFormat | None = None) -> LabelFolder:
 
 
 def _indexed(root: Path, suffix: str, found: list[Path]) -> dict[str | tuple[str, str], Path]:
-    """Files by scan token; in several sequences a token is only good together with its sequence."""
+    """Files by name; in several sequences a name is only good together with its sequence."""
     in_sequences = suffix == semantickitti.SUFFIX
     files: dict[str | tuple[str, str], Path] = {}
     shared: set[str] = set()
     for file in found:
-        token = file.name.removesuffix(suffix)
-        key: str | tuple[str, str] = (file.parent.parent.name, token) if in_sequences else token
+        key: str | tuple[str, str] = (file.parent.parent.name, file.name) if in_sequences else file.name
         if key in files:
             raise _bad(
                 root,
                 "ambiguous-labels",
-                f"holds two label files of scan {token} ({files[key].relative_to(root)}, {file.relative_to(root)})",
+                f"holds {file.name} twice ({files[key].relative_to(root)}, {file.relative_to(root)})",
                 "Name the one folder to read, for example its refined/.",
             )
         files[key] = file
-        if in_sequences and files.setdefault(token, file) != file:
-            shared.add(token)
-    for token in shared:
-        del files[token]
+        if in_sequences and files.setdefault(file.name, file) != file:
+            shared.add(file.name)
+    for name in shared:
+        del files[name]
     return files
 
 
@@ -156,6 +161,19 @@ def read_scan(out: Path | LabelFolder, format: LabelFormat | None, scene: Scene,
     folder = out if isinstance(out, LabelFolder) else open_labels(out, format)
     semantic, instance = folder.read(scene, scan)
     return ScanLabels(scan.token, semantic, instance.astype(np.int32))
+
+
+def wrong_count(scan: Scan, labels: int, points: int) -> LabelError:
+    """What to say of labels that are not one a point."""
+    return LabelError(
+        Problem(
+            code="label-count",
+            where=f"labels of scan {scan.token}",
+            what=f"have {labels:,} values but the scan has {points:,} points",
+            remedy="Were they made from another log? Label this one, or name the log they were made from.",
+            scan=scan.token,
+        )
+    )
 
 
 def _bad(path: Path, code: str, what: str, remedy: str) -> LabelError:

@@ -1,6 +1,7 @@
 """SemanticKITTI label files.
 
-``sequences/<scene>/predictions/<token>.label`` holds one uint32 a point, ``id << 16 | raw class``.
+``sequences/<scene>/predictions/<number>.label`` holds one uint32 a point, ``id << 16 | raw class``. Where a log does
+not number its scans, the token stands for the number.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
 from l3ps.labels.files import file_stem, folder_name, write_whole
 from l3ps.labels.numbering import fitted_instances
@@ -30,7 +32,7 @@ SUFFIX = ".label"
 MAX_INSTANCE = (1 << 16) - 1
 
 
-def write(out: Path, scene: str, labels: Sequence[ScanLabels]) -> list[Path]:
+def write(out: Path, scene: Scene, labels: Sequence[ScanLabels]) -> list[Path]:
     """Write a scene's label files.
 
     Classes become their nearest raw id; trailer and construction vehicle share one (other-vehicle), so reading the
@@ -38,7 +40,7 @@ def write(out: Path, scene: str, labels: Sequence[ScanLabels]) -> list[Path]:
 
     Args:
         out: folder that gets ``sequences/``.
-        scene: the scene's name; names the sequence folder.
+        scene: the scene; names the sequence folder.
         labels: the scene's scans in order.
 
     Returns:
@@ -51,14 +53,23 @@ def write(out: Path, scene: str, labels: Sequence[ScanLabels]) -> list[Path]:
     # Numbered per class of the 19: that and the id are what the official evaluation takes for one segment.
     evaluated = np.asarray(NUSCENES16_TO_SEMANTICKITTI19)
     becomes_stuff = evaluated > max(SEMANTICKITTI19.things)
-    instances = fitted_instances(scene, labels, evaluated, MAX_INSTANCE, NUSCENES16.is_thing & ~becomes_stuff)
-    folder = out / "sequences" / folder_name(scene) / "predictions"
+    instances = fitted_instances(scene.name, labels, evaluated, MAX_INSTANCE, NUSCENES16.is_thing & ~becomes_stuff)
+    folder = out / "sequences" / folder_name(scene.name) / "predictions"
+    names = {scan.token: file_name(scan) for scan in scene.scans}
     written = []
     for scan, ids in zip(labels, instances, strict=True):
         values = raw[scan.semantic] | ids.astype(np.uint32) << 16
-        path = folder / f"{file_stem(scan.token)}{SUFFIX}"
-        written.append(write_whole(path, values.astype("<u4").tobytes()))
+        written.append(write_whole(folder / names[scan.token], values.astype("<u4").tobytes()))
     return written
+
+
+def file_name(scan: Scan) -> str:
+    """Name of a scan's label file.
+
+    Raises:
+        LabelError: the scan's number or token cannot be a file name.
+    """
+    return f"{file_stem(scan.number or scan.token)}{SUFFIX}"
 
 
 def read(path: Path, space: str) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:

@@ -43,5 +43,5 @@ def write_scene(out: Path, format: LabelFormat, scene: Scene, labels: Sequence[S
     if format == "nuscenes":
         return nuscenes.write(out, scene.name, labels)
     if format == "semantickitti":
-        return semantickitti.write(out, scene.name, labels)
+        return semantickitti.write(out, scene, labels)
     raise ValueError(f"unknown label format {format!r}: choose one of {', '.join(FORMATS)}")

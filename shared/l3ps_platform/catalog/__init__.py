@@ -1,10 +1,11 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``jobs``, ``stages``. What changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``jobs``, ``stages``, ``figures`` (sums for the metrics). What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import bundles, drives, jobs, stages, uploads
+from l3ps_platform.catalog import bundles, drives, figures, jobs, stages, uploads
 from l3ps_platform.catalog.models import (
     Base,
     DriveRow,
@@ -52,6 +53,7 @@ __all__ = [
     "UploadState",
     "bundles",
     "drives",
+    "figures",
     "jobs",
     "stages",
     "uploads",

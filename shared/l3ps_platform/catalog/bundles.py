@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from sqlalchemy import func, select
+from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import JobRow, ModelRow, StageRow
@@ -45,8 +46,11 @@ def add(
         object_key=object_key,
         created_at=tx.now,
     )
-    tx.session.add(row)
-    tx.session.flush()
+    try:
+        with tx.session.begin_nested():
+            tx.session.add(row)
+    except IntegrityError:  # another upload took the name in this moment
+        raise Conflict(f"there is a model named {name!r} already: choose another name") from None
     return row
 
 

@@ -46,6 +46,14 @@ def ingest_of(session: Session, *, drive_id: str | None = None, model_id: str | 
     return session.scalars(query.order_by(StageRow.id.desc()).limit(1)).one_or_none()
 
 
+def owned(session: Session, owner_prefix: str) -> list[tuple[str, str]]:
+    """(id, owner) of the running stages whose owner's name begins so."""
+    query = select(StageRow.id, StageRow.lease_owner).where(
+        StageRow.state == StageState.RUNNING, StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
+    )
+    return [(id, owner) for id, owner in session.execute(query) if owner is not None]
+
+
 def steps(session: Session, stage_ids: Sequence[str]) -> dict[str, list[StepRow]]:
     """What the steps inside each stage cost."""
     found: dict[str, list[StepRow]] = {id: [] for id in stage_ids}

@@ -75,6 +75,12 @@ def close(tx: Transaction, id: str, state: UploadState, result_id: str | None = 
     return row
 
 
+def leftover(session: Session, limit: int = 100) -> list[UploadRow]:
+    """Aborted uploads whose parts may still be in the store; a clean one has an empty ``s3_upload_id``."""
+    query = select(UploadRow).where(UploadRow.state == UploadState.ABORTED, UploadRow.s3_upload_id != "")
+    return list(session.scalars(query.limit(limit)))
+
+
 def expired(session: Session, now: datetime, limit: int = 100) -> list[UploadRow]:
     """Open uploads whose time is over."""
     query = select(UploadRow).where(UploadRow.state == UploadState.OPEN, UploadRow.expires_at < now)

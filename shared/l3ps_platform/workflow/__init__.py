@@ -8,6 +8,7 @@ complete, drive_checked,       how it ended, and what follows from that
 Reconciler, lease_lost         what nobody is left to report
 """
 
+from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, heartbeat, report
 from l3ps_platform.workflow.outcomes import (
     Cost,
@@ -19,6 +20,7 @@ from l3ps_platform.workflow.outcomes import (
     fail,
     model_checked,
     release,
+    release_owned,
 )
 from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
@@ -29,6 +31,7 @@ __all__ = [
     "Reconciler",
     "Report",
     "Retry",
+    "Transaction",
     "accept_drive",
     "accept_model",
     "cancel_job",
@@ -44,6 +47,7 @@ __all__ = [
     "model_checked",
     "problems_of",
     "release",
+    "release_owned",
     "report",
     "submit_job",
 ]

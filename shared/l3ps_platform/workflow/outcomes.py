@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 
-from sqlalchemy import delete, update
+from sqlalchemy import delete, select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
@@ -164,6 +165,17 @@ def release(tx: Transaction, claim: Claim) -> None:
         failed(tx, stage, None)
     else:
         enqueue(tx, stage)
+
+
+def release_owned(tx: Transaction, owner_prefix: str) -> int:
+    """Give back every stage whose owner's name begins so; how many. For a worker that was made to stop in mid-stage."""
+    mine = StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
+    count = 0
+    for stage in list(tx.session.scalars(select(StageRow).where(StageRow.state == StageState.RUNNING, mine))):
+        with suppress(LeaseLost):
+            release(tx, Claim(stage.id, stage.attempt, stage.lease_owner or "", stage.name, 0.0))
+            count += 1
+    return count
 
 
 def cancel_job(tx: Transaction, job_id: str) -> JobRow:

@@ -160,4 +160,8 @@ def _refusal(drive: DriveRow, model: ModelRow, job: JobRow) -> InputError | None
         return DriveLogError(spoilt)
     if model.state is ModelState.REJECTED:
         return ModelError(problems_of(model.problem))
+    info = drive.info or {}
+    if info.get("has_truth") and job.settings["protocol"] == "semantickitti" != info.get("truth_space"):
+        what = f"the log's truth is in {info.get('truth_space')} classes, which semantickitti cannot score"
+        return InputError(Problem("protocol-mismatch", "protocol", what, "Choose protocol nuscenes or paper."))
     return None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
@@ -124,14 +125,17 @@ class Reconciler:
 
     def _abort_uploads(self) -> int:
         with self._catalog.reading() as session:
-            rows = uploads.expired(session, self._now())
+            over = uploads.expired(session, self._catalog.now(session))
+        for row in over:
+            with self._catalog.transaction() as tx, suppress(Conflict):  # completed in this moment
+                uploads.close(tx, row.id, UploadState.ABORTED)
+        with self._catalog.reading() as session:
+            rows = uploads.leftover(session)
         for row in rows:
             self._store.abort_multipart(row.object_key, row.s3_upload_id)
+            self._store.delete(row.object_key)  # joined, when the API died before it could say so
             with self._catalog.transaction() as tx:
-                try:
-                    uploads.close(tx, row.id, UploadState.ABORTED)
-                except Conflict:
-                    continue  # completed in this moment; the store then refuses the abort or had no parts left
+                uploads.lock(tx.session, row.id).s3_upload_id = ""
         return len(rows)
 
     def _delete_archives(self) -> int:

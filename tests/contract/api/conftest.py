@@ -1,14 +1,19 @@
 """The real API in a real process, with everything it stands on, and eyes into its catalog and store."""
 
+import json
 import os
 import secrets
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import STOP_WORKER, Stack, StackOptions, free_port
@@ -54,6 +59,22 @@ class Service:
         upload = self.announce(len(data), filename, kind)
         parts = self.put_parts(upload, data)
         return self.http.post(f"/v1/uploads/{upload['id']}/complete", json={"parts": parts, **completion})
+
+    def wait(self, path: str, until: Callable[[dict], bool], seconds: float = 120) -> dict:
+        """The document at a path once it is as wanted."""
+        deadline = time.monotonic() + seconds
+        while not until(document := self.http.get(path).json()):
+            assert time.monotonic() < deadline, document
+            time.sleep(0.1)
+        return document
+
+    def wait_for_drive(self, drive_id: str) -> dict:
+        """A drive once it has been checked."""
+        return self.wait(f"/v1/drives/{drive_id}", lambda drive: drive["state"] in ("ready", "rejected"))
+
+    def wait_for_job(self, job_id: str) -> dict:
+        """A job once it is over."""
+        return self.wait(f"/v1/jobs/{job_id}", lambda job: job["state"] in ("succeeded", "failed", "cancelled"))
 
     def objects(self) -> set[str]:
         """Keys of all uploaded archives; a worker may be writing outputs of other tests' jobs meanwhile."""
@@ -127,6 +148,40 @@ def _looked_into(settings: Settings) -> Iterator[Service]:
     with httpx.Client(base_url=settings.api_url, timeout=30) as http:
         yield Service(http, catalog, open_store(settings), settings)
     catalog.dispose()
+
+
+@pytest.fixture(scope="session")
+def drive_log(tmp_path_factory) -> Path:
+    """A small simulated drive: one scene of three scans."""
+    from l3ps.simulate import simulate_drive
+
+    folder = tmp_path_factory.mktemp("log") / "street"
+    simulate_drive(folder, scenes=1, scans=3, seed=5, width=320)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory) -> Path:
+    """A model bundle that takes bright pixels for cars, green ones for vegetation and the rest for road."""
+    folder = tmp_path_factory.mktemp("bundle") / "colours"
+    folder.mkdir()
+    height, width = 96, 160
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, height, width])
+    logits = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, 3, height, width])
+    weights = numpy_helper.from_array(np.eye(3, dtype=np.float32).reshape(3, 3, 1, 1), "w")
+    graph = helper.make_graph([helper.make_node("Conv", ["image", "w"], ["logits"])], "g", [image], [logits], [weights])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    (folder / "model.onnx").write_bytes(model.SerializeToString())
+    classes = {"car": 4, "vegetation": 16, "road": 11}
+    description = {
+        "name": "colours",
+        "input": {"name": "image", "height": height, "width": width},
+        "output": {"semantic": "logits"},
+        "classes": list(classes),
+        "to_nuscenes": classes,
+    }
+    (folder / "model.json").write_text(json.dumps(description))
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -61,7 +61,7 @@ def up(tmp_path):
     started = []
 
     def start(*options: str) -> Up:
-        started.append(Up(tmp_path / "data", *options))
+        started.append(Up(tmp_path / "my däta", *options))
         return started[-1]
 
     yield start

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 import pytest
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Catalog, JobRow, StageMessage, StageRow, Transaction
+from l3ps_platform.catalog import Base, Catalog, JobRow, StageMessage, StageRow, Transaction
 from l3ps_platform.catalog import jobs as catalog_jobs
 from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.catalog.migrate import upgrade
@@ -80,11 +80,22 @@ def _answering(store: DirectoryStore) -> type[BaseHTTPRequestHandler]:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def catalog_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database of each kind."""
+def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database of each kind, without tables."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'catalog.db'}"
     return Settings(database_url=request.getfixturevalue("postgres_url")).catalog_url
+
+
+@pytest.fixture(scope="session", params=["sqlite", "postgresql"])
+def migrated_url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A database of each kind with tables; tests share it, one after the other."""
+    if request.param == "sqlite":
+        url = f"sqlite:///{tmp_path_factory.mktemp('catalog') / 'catalog.db'}"
+    else:
+        url = Settings(database_url=request.getfixturevalue("postgres_server").get_uri()).catalog_url
+    upgrade(url)
+    return url
 
 
 @pytest.fixture
@@ -94,10 +105,12 @@ def sent() -> list[StageMessage]:
 
 
 @pytest.fixture
-def catalog(catalog_url: str, sent: list[StageMessage]) -> Iterator[Catalog]:
-    """A migrated catalog of each kind whose messages land in ``sent``."""
-    upgrade(catalog_url)
-    made = Catalog(catalog_url, sent.extend)
+def catalog(migrated_url: str, sent: list[StageMessage]) -> Iterator[Catalog]:
+    """An empty catalog of each kind whose messages land in ``sent``."""
+    made = Catalog(migrated_url, sent.extend)
+    with made.transaction() as tx:
+        for table in reversed(Base.metadata.sorted_tables):
+            tx.session.execute(table.delete())
     yield made
     made.dispose()
 
@@ -121,7 +134,7 @@ class Play:
             row = workflow.accept_drive(tx, name="drive", filename="d.zip", size=9, object_key="uploads/u/d.zip")
         info = {"scenes": [{"name": f"scene-{n}", "scans": 2, "points": 10} for n in range(scenes)]}
         verdict = {"usable": True, "problems": [], "sha256": "d" * 64, "format": "nuscenes", "info": info} | verdict
-        self.run(lambda tx, claim: workflow.drive_checked(tx, claim, COST, **verdict))
+        self.run(lambda tx, claim: workflow.drive_checked(tx, claim, COST, **verdict), self.sent.pop())
         return row.id
 
     def model(self, **verdict: Any) -> str:
@@ -130,7 +143,7 @@ class Play:
             name = f"model-{secrets.token_hex(4)}"
             row = workflow.accept_model(tx, name=name, filename="m.zip", size=9, object_key="uploads/u/m.zip")
         verdict = {"problems": [], "sha256": "a" * 64, "info": {}} | verdict
-        self.run(lambda tx, claim: workflow.model_checked(tx, claim, COST, **verdict))
+        self.run(lambda tx, claim: workflow.model_checked(tx, claim, COST, **verdict), self.sent.pop())
         return row.id
 
     def take(self, message: StageMessage | None = None, owner: str = "worker-1", lease: float = 60.0):

@@ -44,6 +44,16 @@ def test_sequences_keep_equal_tokens_apart(make_scene, tmp_path):
         folder.read(other, other.scans[0])
 
 
+def test_scans_of_numbered_logs_keep_their_numbers(make_scene, tmp_path):
+    scenes = [make_scene(name, [f"{name}_000007"], ["000007"]) for name in ("00", "08")]
+    for cls, scene in zip((4, 10), scenes, strict=True):
+        (file,) = write_scene(tmp_path, "semantickitti", scene, [labels(f"{scene.name}_000007", cls=cls)])
+        assert file == tmp_path / "sequences" / scene.name / "predictions" / "000007.label"
+        write_scene(tmp_path / "npz", "nuscenes", scene, [labels(f"{scene.name}_000007", cls=cls)])
+    for folder in (open_labels(tmp_path, "semantickitti"), open_labels(tmp_path / "npz")):
+        assert [int(read_scan(folder, None, s, s.scans[0]).semantic[0]) for s in scenes] == [4, 10]
+
+
 def test_predictions_win_over_the_truth_beside_them(scene, tmp_path):
     (made,) = write_scene(tmp_path, "semantickitti", scene, [labels("a", cls=10)])
     truth = made.parent.parent / "labels" / "a.label"
@@ -64,7 +74,7 @@ def test_moving_and_parked_car_of_one_id_are_one_car(scene, tmp_path):
 def test_folders_of_both_results_are_ambiguous(scene, tmp_path):
     for stage in ("primal", "refined"):
         write_scene(tmp_path / stage, "nuscenes", scene, [labels("a")])
-    with pytest.raises(LabelError, match=r"two label files of scan a \(primal/.*refined/"):
+    with pytest.raises(LabelError, match=r"holds a_panoptic\.npz twice \(primal/.*refined/"):
         open_labels(tmp_path)
 
 
@@ -122,7 +132,9 @@ def test_tokens_from_a_log_cannot_leave_the_folder(make_scene, tmp_path, token, 
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
 
 
-@pytest.mark.parametrize(("name", "folder"), [("../..", "_.."), ("a/b c", "a_b_c"), ("", "00"), ("...", "00")])
+@pytest.mark.parametrize(
+    ("name", "folder"), [("../..", "_"), ("a/b c", "a_b_c"), ("two words", "two words"), ("", "00"), ("...", "00")]
+)
 def test_scene_names_become_harmless_folders(make_scene, tmp_path, name, folder):
     scene = make_scene(name, ["a"])
     (file,) = write_scene(tmp_path, "semantickitti", scene, [labels("a")])

@@ -24,7 +24,7 @@ def test_round_trip_over_two_scenes(make_scene, tmp_path):
     kitti = np.loadtxt(tmp_path / "poses.txt")
     assert kitti.shape == (3, 12)
     np.testing.assert_allclose(kitti[1].reshape(3, 4)[:, 3], [1234.5678901, -3e-7, 0], atol=1e-8)
-    assert (tmp_path / "scans.txt").read_text().splitlines()[0] == "scene with space a"
+    assert (tmp_path / "scans.txt").read_text().splitlines()[0] == "scene with space\ta"
 
 
 def test_poses_must_match_the_scans(make_scene, tmp_path):

@@ -1,4 +1,4 @@
-"""Health, readiness and metrics."""
+"""Health, readiness and metrics: asked by machines of the same network, so they need no token."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pydantic import BaseModel, Field
 from l3ps_api.services import ServicesDep
 from l3ps_api.system.checks import check_all
 
-health_router = APIRouter(tags=["system"])
-metrics_router = APIRouter(tags=["system"])
+router = APIRouter(tags=["system"])
 
 
 class Health(BaseModel):
@@ -22,19 +21,19 @@ class Readiness(BaseModel):
     checks: dict[str, str] = Field(description="What was asked and how it answered.")
 
 
-@health_router.get("/healthz")
+@router.get("/healthz")
 async def healthz() -> Health:
     """Whether the process answers at all."""
     return Health()
 
 
-@health_router.get("/readyz")
+@router.get("/readyz")
 def readyz(services: ServicesDep) -> Readiness:
     """Whether catalog, object store and queue answer; 503 names those that do not."""
     return Readiness(checks=check_all(services))
 
 
-@metrics_router.get("/metrics", response_class=Response)
+@router.get("/metrics", response_class=Response)
 def metrics(request: Request) -> Response:
     """Prometheus metrics, those of the service computed from the catalog at this moment."""
     return Response(generate_latest(request.app.state.registry), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,67 @@
+"""Content-addressed keys of stage outputs: the same inputs, settings and code give the same key.
+
+A job that asks for what is there already gets it at once, and a changed vote rule runs again from the stored primal
+labels, because the key of a segment stage covers only the code and the settings that segmentation uses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import l3ps
+from l3ps.presets import Preset
+
+_ROOT = Path(l3ps.__path__[0])
+_SEGMENTATION = ("segment", "drivelog", "project.py", "geometry.py", "taxonomy.py", "pipeline.py", "labels/types.py")
+_NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
+
+
+def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset, *, skip: bool) -> str:
+    """Key of a scene's primal labels."""
+    return _key(
+        "segment",
+        drive=drive_sha256,
+        model=model_sha256,
+        scene=scene,
+        min_area=preset.min_area,
+        skip=skip,
+        code=code_version(_SEGMENTATION),
+    )
+
+
+def refine_key(primal_key: str, preset: Preset, formats: list[str], protocol: str) -> str:
+    """Key prefix of a scene's refined labels and label files."""
+    return _key(
+        "refine",
+        primal=primal_key,
+        preset=preset.as_dict(),
+        formats=sorted(formats),
+        protocol=protocol,
+        code=code_version(),
+    )
+
+
+@cache
+def code_version(parts: tuple[str, ...] = ()) -> str:
+    """A digest of the method's source: the given files and folders of ``l3ps``, or all that decides labels."""
+    files = [path for path in _ROOT.rglob("*.py") if _covered(path.relative_to(_ROOT).as_posix(), parts)]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.relative_to(_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _covered(path: str, parts: tuple[str, ...]) -> bool:
+    def below(names: tuple[str, ...]) -> bool:
+        return any(path == name or path.startswith(f"{name}/") for name in names)
+
+    return below(parts) if parts else not below(_NOT_METHOD)
+
+
+def _key(stage: str, **inputs: Any) -> str:
+    text = json.dumps({"stage": stage, **inputs}, sort_keys=True, separators=(",", ":"))
+    return f"stages/{stage}-{hashlib.sha256(text.encode()).hexdigest()}"

@@ -1,0 +1,146 @@
+"""A scene's refined labels, the label files of both sides, poses, and the scene's quality."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l3ps.costs import CostBook
+from l3ps.drivelog import Drive, Scene
+from l3ps.errors import ProcessingError
+from l3ps.evaluate import evaluate_scene
+from l3ps.labels import ScanLabels, write_poses, write_scene
+from l3ps.pipeline import REFINE_STAGES, refine_scene
+from l3ps.progress import Progress
+from l3ps_platform import workflow
+from l3ps_platform.catalog import Json
+from l3ps_platform.errors import ObjectMissing
+from l3ps_platform.objects import segment as key_segment
+from l3ps_worker.arrays import read_labels
+from l3ps_worker.context import Context
+from l3ps_worker.keys import refine_key
+from l3ps_worker.segment import primal_key
+from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work
+
+STEPS = (*REFINE_STAGES, "write", "evaluate", "store")
+SCENE_MANIFEST = "scene.json"
+
+
+def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
+    """Refine, write, evaluate and store one scene; its ``scene.json`` is stored last and names all the rest."""
+    work = scene_work(context, claim)
+    prefix = refine_key(primal_key(work), work.preset, work.job.settings["formats"], work.job.settings["protocol"])
+    manifest_key = f"{prefix}/{SCENE_MANIFEST}"
+    try:
+        stored: Json = json.loads(context.store.get_bytes(manifest_key))
+        return _done(manifest_key, stored, work, cached=True)
+    except ObjectMissing:
+        pass
+    book = CostBook()
+    with opened_scene(context, work, progress) as (drive, scene), context.scratch.workdir() as folder:
+        primal = _primal(context, work, folder)
+        refined = refine_scene(
+            scene,
+            primal,
+            work.preset,
+            sensor_height=drive.sensor_height,
+            threads=context.settings.threads,
+            progress=progress,
+        )
+        sides = {"primal": primal, "refined": refined.labels}
+        out = folder / "out"
+        with book.span("write"):
+            files = _write(out, work.job.settings["formats"], scene, sides, refined.poses, progress)
+        with book.span("evaluate"):
+            quality = _evaluate(drive, scene, sides, work.job.settings["protocol"], progress)
+        with book.span("store"):
+            entries = _store(context, prefix, out, files, progress)
+    manifest = {"scene": work.scene.name, "files": entries, "quality": quality}
+    context.store.put_bytes(manifest_key, json.dumps(manifest, indent=1).encode())
+    costs = {**refined.costs, **book.stages}
+    steps = {name: (cost.seconds, cost.peak_mb) for name, cost in costs.items()}
+    return _done(manifest_key, manifest, work, steps=steps)
+
+
+def _done(
+    key: str,
+    manifest: Json,
+    work: SceneWork,
+    *,
+    cached: bool = False,
+    steps: dict[str, tuple[float, float]] | None = None,
+) -> Done:
+    quality = manifest["quality"]
+
+    def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
+        workflow.complete(tx, claim, cost, output_key=key, quality=quality)
+
+    return Done(finish, work.scene.scans, work.scene.points, cached=cached, steps=steps or {})
+
+
+def _primal(context: Context, work: SceneWork, folder: Path) -> list[ScanLabels]:
+    try:
+        context.store.get_file(primal_key(work), folder / "primal.npz")
+    except ObjectMissing:
+        raise ProcessingError("the scene's primal labels are gone from the store: submit the job again") from None
+    return read_labels(folder / "primal.npz")
+
+
+def _write(
+    out: Path,
+    formats: Sequence[str],
+    scene: Scene,
+    sides: dict[str, list[ScanLabels]],
+    poses: NDArray[np.float64],
+    progress: Progress,
+) -> list[tuple[Path, str | None]]:
+    """Write all files below ``out``; each with the format it belongs to, None for those of every format."""
+    files: list[tuple[Path, str | None]] = []
+    tasks = [(side, format) for side in sides for format in formats]
+    for done, (side, format) in enumerate(tasks, start=1):
+        files += [(path, format) for path in write_scene(out / side, format, scene, sides[side])]  # type: ignore[arg-type]
+        progress("write", done, len(tasks))
+    files += [(path, None) for path in write_poses(out, [(scene, poses)])]
+    return files
+
+
+def _evaluate(
+    drive: Drive, scene: Scene, sides: dict[str, list[ScanLabels]], protocol: str, progress: Progress
+) -> Json | None:
+    """The evaluators' states of both sides, or None where the scene has no truth."""
+    if not any(scan.load_truth is not None for scan in scene.scans):
+        return None
+    states: dict[str, Any] = {"protocol": protocol}
+    for done, (side, labels) in enumerate(sides.items(), start=1):
+        states[side] = evaluate_scene(drive, scene, labels, protocol).state()
+        progress("evaluate", done, len(sides))
+    return states
+
+
+def _store(
+    context: Context, prefix: str, out: Path, files: Sequence[tuple[Path, str | None]], progress: Progress
+) -> list[Json]:
+    entries: list[Json] = []
+    for done, (path, format) in enumerate(files, start=1):
+        relative = path.relative_to(out)
+        key = "/".join([prefix, *map(key_segment, relative.parts)])
+        context.store.put_file(key, path)
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        entries.append(
+            {
+                "path": relative.as_posix(),
+                "format": format,
+                "size": path.stat().st_size,
+                "sha256": sha256,
+                "key": key,
+            }
+        )
+        progress("store", done, len(files))
+    return entries

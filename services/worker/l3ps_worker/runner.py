@@ -1,0 +1,137 @@
+"""One stage from claim to outcome. Celery's tasks are thin around this; tests call it directly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import structlog
+
+from l3ps.costs import CostBook
+from l3ps.errors import Cancelled, InputError, ProcessingError
+from l3ps.progress import Progress
+from l3ps_platform import workflow
+from l3ps_platform.catalog import Json, StageName
+from l3ps_platform.errors import LeaseLost
+from l3ps_platform.telemetry import bound
+from l3ps_worker.context import Context
+from l3ps_worker.ingest import ingest
+from l3ps_worker.liveness import Heartbeat, StageProgress, Stopping
+from l3ps_worker.publish import publish
+from l3ps_worker.refine import STEPS as REFINE_STEPS
+from l3ps_worker.refine import refine
+from l3ps_worker.segment import segment
+from l3ps_worker.work import Done
+
+log = structlog.get_logger(__name__)
+
+Work = Callable[[Context, workflow.Claim, Progress], Done]
+Outcome = Literal["done", "failed", "cancelled", "released", "lost", "not-claimed"]
+
+WORK: dict[StageName, tuple[Work, Sequence[str]]] = {
+    StageName.INGEST: (ingest, ("fetch", "unpack", "validate", "count")),
+    StageName.SEGMENT: (segment, ("segment",)),
+    StageName.REFINE: (refine, REFINE_STEPS),
+    StageName.PUBLISH: (publish, ("publish",)),
+}
+"""What does each stage, and the steps its progress counts."""
+
+
+def run_stage(context: Context, stage_id: str, attempt: int) -> Outcome:
+    """Claim a stage, do its work and record how it ended. Never raises for what the stage's work does."""
+    with bound(stage=stage_id, attempt=attempt):
+        settings = context.settings
+        with context.catalog.transaction() as tx:
+            claim = workflow.claim(
+                tx,
+                stage_id,
+                attempt,
+                context.owner,
+                lease_seconds=settings.lease_seconds,
+                max_attempts=settings.max_attempts,
+            )
+        if claim is None:
+            log.info("nothing to do for this message")
+            return "not-claimed"
+        owner = {"job": claim.job_id, "scene": claim.scene_id, "drive": claim.drive_id, "model": claim.model_id}
+        with bound(kind=claim.name.value, **owner):
+            try:
+                return _run_claimed(context, claim)
+            except LeaseLost as error:
+                log.warning("stage lost", reason=str(error))
+                return "lost"
+
+
+def _run_claimed(context: Context, claim: workflow.Claim) -> Outcome:
+    work, steps = WORK[claim.name]
+    book = CostBook()
+    done: Done | None = None
+    try:
+        with Heartbeat(context, claim) as heartbeat, book.span("stage"):
+            done = work(context, claim, StageProgress(context, claim, heartbeat, steps))
+    except (LeaseLost, KeyboardInterrupt, SystemExit):
+        raise
+    except Cancelled:
+        return _cancelled(context, claim, _cost(book, done))
+    except Stopping:
+        return _released(context, claim)
+    except MemoryError:
+        # Left to Celery, a MemoryError takes down the worker's main process and comes back with the message for ever.
+        error = _error("the worker ran out of memory; use smaller scenes or a worker with more memory")
+        return _failed(context, claim, error, _cost(book, done), retry=True)
+    except (InputError, ProcessingError) as caught:
+        # The same input fails the same way: no second try.
+        return _failed(context, claim, workflow.error_json(caught), _cost(book, done), retry=False)
+    except Exception as caught:
+        log.exception("stage broke")
+        reason = f"{type(caught).__name__}: {caught}"
+        return _failed(context, claim, _error(reason), _cost(book, done), retry=True)
+    cost = _cost(book, done)
+    with context.catalog.transaction() as tx:
+        done.finish(tx, claim, cost)
+    log.info("stage done", seconds=round(cost.seconds, 3), points=cost.points, cached=cost.cached)
+    done.afterwards()
+    return "done"
+
+
+def _cancelled(context: Context, claim: workflow.Claim, cost: workflow.Cost) -> Outcome:
+    with context.catalog.transaction() as tx:
+        workflow.cancelled(tx, claim, cost)
+    log.info("stage cancelled")
+    return "cancelled"
+
+
+def _released(context: Context, claim: workflow.Claim) -> Outcome:
+    with context.catalog.transaction() as tx:
+        workflow.release(tx, claim)
+    log.info("stage given back")
+    return "released"
+
+
+def _failed(context: Context, claim: workflow.Claim, error: Json, cost: workflow.Cost, *, retry: bool) -> Outcome:
+    settings = context.settings
+    again = workflow.Retry(settings.max_attempts, settings.retry_seconds) if retry else None
+    with context.catalog.transaction() as tx:
+        workflow.fail(tx, claim, error, retry=again, cost=cost)
+    log.warning("stage failed", reason=error["message"], retry=retry and claim.attempt < settings.max_attempts)
+    return "failed"
+
+
+def _cost(book: CostBook, done: Done | None) -> workflow.Cost:
+    spent = book.stages["stage"]
+    steps = done.steps if done is not None else {}
+    # Steps inside reset the kernel's mark, so the highest of all is the stage's.
+    peak = max([spent.peak_mb, *(mb for _, mb in steps.values())])
+    return workflow.Cost(
+        seconds=spent.seconds,
+        cpu_seconds=spent.cpu_seconds,
+        peak_mb=peak,
+        scans=done.scans if done else 0,
+        points=done.points if done else 0,
+        cached=done.cached if done else False,
+        steps=steps,
+    )
+
+
+def _error(message: str) -> Json:
+    return {"message": message, "problems": []}

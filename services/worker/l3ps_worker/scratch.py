@@ -1,0 +1,128 @@
+"""The worker's disk: unpacked drives and models by checksum, and folders for work in progress.
+
+    SCRATCH/cache/<key>/log      an unpacked drive or a model; the key is what it is and its sha256
+    SCRATCH/locks/<key>          shared while in use, exclusive while being made or deleted
+    SCRATCH/work/<random>/       what a stage is writing; its lock tells the living from the dead
+
+Processes agree by ``flock``, which the kernel gives back however a process ends.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import structlog
+
+log = structlog.get_logger(__name__)
+
+
+class Scratch:
+    """A size-bounded cache and a place to work.
+
+    Args:
+        root: the directory.
+        budget: bytes the cache may hold; entries in use stay even beyond it.
+    """
+
+    def __init__(self, root: Path, budget: int) -> None:
+        self._cache = root / "cache"
+        self._locks = root / "locks"
+        self._work = root / "work"
+        self._budget = budget
+        for folder in (self._cache, self._locks, self._work):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def entry(self, key: str, make: Callable[[Path], object]) -> Iterator[Path]:
+        """A cached file or folder, in use until the block ends.
+
+        Args:
+            key: names the content; equal keys are equal content.
+            make: fills a path that does not exist yet, when nobody has; called by one process at a time.
+        """
+        with (self._locks / key).open("a+b") as lock:
+            content = self._cache / key / "log"
+            fcntl.flock(lock, fcntl.LOCK_SH)
+            while not content.exists():
+                fcntl.flock(lock, fcntl.LOCK_EX)  # lets go of the shared lock first, so look again
+                if not content.exists():
+                    self._make(key, make)
+                fcntl.flock(lock, fcntl.LOCK_SH)  # may let an eviction in between, so look again
+            os.utime(content.parent)
+            yield content
+
+    def drop(self, key: str) -> None:
+        """Delete an entry unless it is in use."""
+        with (self._locks / key).open("a+b") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return
+            shutil.rmtree(self._cache / key, ignore_errors=True)
+
+    @contextmanager
+    def workdir(self) -> Iterator[Path]:
+        """An empty folder that is gone after the block; those of dead processes are swept on the way."""
+        self._sweep()
+        folder = self._work / secrets.token_hex(8)
+        lock_path = self._locks / f"work-{folder.name}"
+        with lock_path.open("a+b") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            folder.mkdir()
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+                lock_path.unlink(missing_ok=True)
+
+    def _make(self, key: str, make: Callable[[Path], object]) -> None:
+        self._evict()
+        entry = self._cache / key
+        shutil.rmtree(entry, ignore_errors=True)  # half of one that a killed process began
+        entry.mkdir()
+        try:
+            make(entry / "new")
+            (entry / "size").write_text(str(_size(entry / "new")))
+            (entry / "new").rename(entry / "log")
+        except BaseException:
+            shutil.rmtree(entry, ignore_errors=True)
+            raise
+
+    def _evict(self) -> None:
+        """Delete entries, the longest unused first, until the cache is within its budget."""
+        entries = []
+        for entry in self._cache.iterdir():
+            try:
+                entries.append((entry.stat().st_mtime, int((entry / "size").read_text()), entry.name))
+            except (OSError, ValueError):
+                continue  # being made or deleted in this moment
+        held = sum(size for _, size, _ in entries)
+        for _, size, key in sorted(entries):
+            if held <= self._budget:
+                return
+            self.drop(key)
+            if not (self._cache / key).exists():
+                held -= size
+                log.info("scratch entry evicted", key=key, bytes=size)
+
+    def _sweep(self) -> None:
+        for lock_path in self._locks.glob("work-*"):
+            try:
+                with lock_path.open("r+b") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(self._work / lock_path.name.removeprefix("work-"), ignore_errors=True)
+                    lock_path.unlink(missing_ok=True)
+            except (BlockingIOError, FileNotFoundError):
+                continue
+
+
+def _size(path: Path) -> int:
+    if path.is_file():
+        return path.stat().st_size
+    return sum((Path(folder) / name).lstat().st_size for folder, _, names in os.walk(path) for name in names)

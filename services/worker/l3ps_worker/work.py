@@ -1,0 +1,145 @@
+"""What the stages share: the rows they work on, fetching inputs, and what they return."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from l3ps.drivelog import Drive, Scene, UnpackLimits, open_drive, unpack, validate, without_bad_scans
+from l3ps.errors import ProcessingError
+from l3ps.presets import PRESETS, Preset
+from l3ps.progress import Progress
+from l3ps_platform import workflow
+from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
+from l3ps_platform.errors import ObjectMissing
+from l3ps_platform.settings import Settings
+from l3ps_worker.context import Context
+
+_CHUNK = 1 << 20
+
+Finish = Callable[[Transaction, workflow.Claim, workflow.Cost], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A stage's work is done; how to record it.
+
+    Attributes:
+        finish: writes the outcome, in one transaction with all that follows from it.
+        scans, points: how much was processed.
+        cached: the output was there already.
+        steps: (seconds, peak MB) of the steps inside.
+        afterwards: runs after the commit; what it leaves undone the reconciler does.
+    """
+
+    finish: Finish
+    scans: int = 0
+    points: int = 0
+    cached: bool = False
+    steps: dict[str, tuple[float, float]] = field(default_factory=dict)
+    afterwards: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True, slots=True)
+class SceneWork:
+    """The rows behind a segment or refine stage."""
+
+    job: JobRow
+    scene: SceneRow
+    drive: DriveRow
+    model: ModelRow
+
+    @property
+    def preset(self) -> Preset:
+        """The job's preset. ProcessingError when this worker does not know it."""
+        name = self.job.settings["preset"]
+        if name not in PRESETS:
+            raise ProcessingError(f"this worker knows no preset {name!r}; it knows {', '.join(PRESETS)}")
+        return PRESETS[name]
+
+    @property
+    def skip(self) -> bool:
+        """Whether scans are left out of this drive; a drive without bad scans gives the same result either way."""
+        problems = workflow.problems_of(self.drive.problem)
+        return bool(self.job.settings["skip_bad_scans"]) and any(p.severity != "warning" for p in problems)
+
+
+def scene_work(context: Context, claim: workflow.Claim) -> SceneWork:
+    """Read the rows of a scene's stage."""
+    assert claim.job_id is not None and claim.scene_id is not None
+    with context.catalog.reading() as session:
+        job = jobs.get(session, claim.job_id)
+        scene = session.get_one(SceneRow, claim.scene_id)
+        drive = drives.many(session, [job.drive_id])[job.drive_id]
+        return SceneWork(job, scene, drive, bundles.get(session, job.model_id))
+
+
+@contextmanager
+def opened_scene(context: Context, work: SceneWork, progress: Progress) -> Iterator[tuple[Drive, Scene]]:
+    """The stage's drive, unpacked in the scratch, and its scene; bad scans left out where the job says so."""
+    with unpacked(context, work.drive, progress) as root:
+        drive = open_drive(root)
+        if work.skip:
+            drive = without_bad_scans(drive, validate(drive, progress))
+        scene = next((scene for scene in drive.scenes if scene.name == work.scene.name), None)
+        if scene is None:
+            raise ProcessingError(f"drive {work.drive.id} has no scene {work.scene.name!r}: upload the drive again")
+        yield drive, scene
+
+
+@contextmanager
+def unpacked(context: Context, drive: DriveRow, progress: Progress) -> Iterator[Path]:
+    """The folder of a checked drive's log."""
+    assert drive.sha256 is not None
+
+    def make(target: Path) -> None:
+        with context.scratch.workdir() as folder:
+            archive = folder / "archive"
+            download(context, drive.object_key, archive, drive.size, progress)
+            unpack(archive, target, unpack_limits(context.settings), name=drive.filename, progress=progress)
+
+    with context.scratch.entry(f"drive-{drive.sha256}", make) as root:
+        yield root
+
+
+@contextmanager
+def model_file(context: Context, model: ModelRow, progress: Progress) -> Iterator[Path]:
+    """The zip of a checked model."""
+    assert model.sha256 is not None
+
+    def make(target: Path) -> None:
+        download(context, model.object_key, target, model.size, progress)
+
+    with context.scratch.entry(f"model-{model.sha256}", make) as path:
+        yield path
+
+
+def download(context: Context, key: str | None, path: Path, size: int, progress: Progress) -> str:
+    """Fetch an object into a file and return its sha256; the progress step is ``fetch``, in bytes."""
+    if key is None:
+        raise ProcessingError("the uploaded archive is no longer in the store: upload it again")
+    digest = hashlib.sha256()
+    done = 0
+    try:
+        with context.store.open(key) as source, path.open("wb") as file:
+            while chunk := source.read(_CHUNK):
+                file.write(chunk)
+                digest.update(chunk)
+                done += len(chunk)
+                progress("fetch", done, max(size, done))
+    except ObjectMissing:
+        raise ProcessingError("the uploaded archive is no longer in the store: upload it again") from None
+    return digest.hexdigest()
+
+
+def unpack_limits(settings: Settings) -> UnpackLimits:
+    """The unpacker's limits from the settings."""
+    return UnpackLimits(
+        max_files=settings.unpack_max_files,
+        max_file_bytes=settings.unpack_max_file_bytes,
+        max_total_bytes=settings.unpack_max_total_bytes,
+        max_ratio=settings.unpack_max_ratio,
+    )
