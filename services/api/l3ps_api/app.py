@@ -56,7 +56,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.services = services
     app.state.token = settings.token.get_secret_value() if settings.token else None
     app.state.registry = CollectorRegistry()
-    app.state.registry.register(CatalogCollector(catalog, queue, settings))
+    app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     guarded = [Depends(require_token)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -65,8 +65,11 @@ def create_app(settings: Settings) -> FastAPI:
     errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(BodyLimit, exempt="/v1/objects/")
-    if settings.host in ("127.0.0.1", "localhost", "::1") and not settings.public_url:
+    loopback = settings.host in ("127.0.0.1", "localhost", "::1")
+    if loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
+    if not loopback and app.state.token is None:
+        log.warning("anyone who reaches this address may use the service: set L3PS_TOKEN", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     problems.describe_in_openapi(app)
     return app

@@ -121,15 +121,27 @@ class Client:
     def fetch(self, url: str, target: Path, report: Callable[[int], None] = lambda received: None) -> None:
         """Download a presigned URL into a file; the file appears only when whole."""
         partial = target.with_name(target.name + ".part")
+        for attempt in range(1, _TRIES + 1):
+            try:
+                self._receive(url, partial, report)
+                break
+            except httpx.TransportError as error:
+                report(-partial.stat().st_size if partial.exists() else 0)
+                partial.unlink(missing_ok=True)
+                if attempt == _TRIES:
+                    raise ServiceUnreachableError(self._unreachable(error)) from error
+                time.sleep(_pause(attempt))
+        partial.replace(target)
+
+    def _receive(self, url: str, partial: Path, report: Callable[[int], None]) -> None:
         with self._objects.stream("GET", self._absolute(url)) as answer:
             if answer.is_error:
                 answer.read()
                 raise _refusal(answer)
-            with partial.open("wb") as file:
+            with partial.open("wb", buffering=0) as file:
                 for block in answer.iter_bytes(_CHUNK):
                     file.write(block)
                     report(len(block))
-        partial.replace(target)
 
     def _put_part(self, file: Path, part: Document, size: int, report: Callable[[int], None]) -> Document:
         number = int(part["number"])
@@ -175,7 +187,7 @@ class Client:
             except httpx.TransportError as error:
                 if attempt == _TRIES or not (repeat or isinstance(error, httpx.ConnectError)):
                     raise ServiceUnreachableError(self._unreachable(error)) from error
-                time.sleep(0.1 * 2**attempt)
+                time.sleep(_pause(attempt))
                 continue
             if answer.status_code in _BUSY and attempt < _TRIES:
                 time.sleep(min(float(answer.headers.get("retry-after", "1")), 5.0))
@@ -190,6 +202,11 @@ class Client:
             f"No answer from the service at {self.url} ({error}). Start one with `l3ps up`, "
             "or set L3PS_URL to the address of one that runs."
         )
+
+
+def _pause(attempt: int) -> float:
+    """Seconds before the next try: 0.2, 0.4, 0.8."""
+    return 0.1 * float(2**attempt)
 
 
 def _refusal(answer: httpx.Response) -> Exception:

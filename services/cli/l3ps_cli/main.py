@@ -1,30 +1,55 @@
-"""The ``l3ps`` command: one file a subcommand."""
+"""The ``l3ps`` command: one file a subcommand, imported when it is asked for.
+
+The method's packages take about four seconds of CPU time to import, which commands that only talk to a service, and
+the process that only watches over the embedded stack, need not spend.
+"""
 
 from __future__ import annotations
 
-import typer
+from importlib import import_module
+from typing import Any
 
-from l3ps_cli import bench
-from l3ps_cli.demo import demo
-from l3ps_cli.download import download
-from l3ps_cli.draw import draw
-from l3ps_cli.evaluate import evaluate
-from l3ps_cli.jobs import jobs
-from l3ps_cli.label import label
-from l3ps_cli.simulate import simulate
-from l3ps_cli.submit import submit
-from l3ps_cli.up import up
+import typer
+from typer.core import TyperGroup
+
+COMMANDS = ("label", "evaluate", "draw", "simulate", "bench", "up", "submit", "jobs", "download", "demo")
+"""In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands."""
+
+
+class _OnDemand(TyperGroup):
+    """A group whose commands are imported when named, or all of them for the help."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names of all commands."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One command, or None when there is none of that name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"l3ps_cli.{cmd_name}")
+        if hasattr(module, "app"):
+            group = typer.main.get_group(module.app)
+            group.name = cmd_name
+            return group
+        alone = typer.Typer(add_completion=False)
+        alone.command(cmd_name)(getattr(module, cmd_name))
+        return typer.main.get_command(alone)
+
 
 app = typer.Typer(
+    cls=_OnDemand,
     name="l3ps",
-    help="LiDAR label engine: drive logs in, panoptic-labelled point clouds out, on CPUs alone.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-for command in (label, evaluate, draw, simulate, up, submit, jobs, download, demo):
-    app.command()(command)
-app.add_typer(bench.app, name="bench")
+
+
+@app.callback()
+def l3ps() -> None:
+    """LiDAR label engine: drive logs in, panoptic-labelled point clouds out, on CPUs alone."""
+
 
 if __name__ == "__main__":
     app()

@@ -119,7 +119,7 @@ class PanopticEvaluator:
         missed = truth_area >= self.protocol.min_points
         missed[truth_of[hit]] = False
         self.fn += np.bincount(truth_class[missed], minlength=n_classes)
-        wrong = (pred_area >= self.protocol.min_points) & (pred_class != 0)
+        wrong = pred_area >= self.protocol.min_points
         wrong[pred_of[hit]] = False
         self.fp += np.bincount(pred_class[wrong], minlength=n_classes)
 

@@ -117,8 +117,8 @@ def test_a_job_that_was_waiting_when_its_drive_was_rejected_fails_with_its_probl
 
 def test_a_scan_of_three_bytes_is_named_and_can_be_skipped(service, log, model):
     drive = service.wait_for_drive(service.upload(scan_of_three_bytes(log), "torn.zip").json()["id"])
-    (problem,) = [problem for problem in drive["problems"] if problem["severity"] == "scan"]
-    assert "LIDAR_TOP" in problem["where"] and "3 bytes" in problem["what"]
+    torn = [problem for problem in drive["problems"] if "LIDAR_TOP" in problem["where"]]
+    assert len(torn) == 1 and "3 bytes" in torn[0]["what"] and torn[0]["severity"] == "scan", drive["problems"]
 
     request = {"drive_id": drive["id"], "model": model, "preset": "fast"}
     document = service.refused(service.http.post("/v1/jobs", json=request), 422, "unusable-input")

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 from l3ps_cli.main import app
 from l3ps_cli.packing import pack_bundle, pack_log
 
+SUBMIT = ("--preset", "fast", "--format", "nuscenes", "--format", "semantickitti", "--wait", "--json")
+
 
 @pytest.fixture(scope="session")
 def command(service):
@@ -29,8 +31,7 @@ def command(service):
 @pytest.fixture(scope="session")
 def finished(service, command, drive_log, bundle) -> dict:
     """A job that ``l3ps submit --wait`` saw through."""
-    formats = ("--format", "nuscenes", "--format", "semantickitti")
-    code, out, err = command("submit", drive_log, "--model", bundle, "--preset", "fast", *formats, "--wait", "--json")
+    code, out, err = command("submit", drive_log, "--model", bundle, *SUBMIT)
     assert code == 0, err
     return json.loads(out)
 
@@ -91,7 +92,7 @@ def test_the_jobs_command_lists_and_shows(command, finished):
 
 
 def test_what_the_service_has_is_not_sent_again_and_not_computed_again(service, command, finished, drive_log, bundle):
-    code, out, err = command("submit", drive_log, "--model", bundle, "--preset", "fast", "--wait", "--json")
+    code, out, err = command("submit", drive_log, "--model", bundle, *SUBMIT)
     again = json.loads(out)
     assert code == 0 and "has this log already" in err
     assert again["drive"]["id"] == finished["drive"]["id"]

@@ -150,6 +150,18 @@ def test_a_picture_of_the_whole_scene_uses_the_poses_of_the_run(log, labels, tmp
     assert "scene 00: has no poses to accumulate its scans by." in without.stderr
 
 
+def test_a_whole_scene_without_a_run_uses_the_poses_of_the_log(log, labels, tmp_path):
+    (labels.parent / "poses.txt").unlink()
+    # The car drives 20 m ahead; the world's axes are turned by a quarter against it.
+    rows = ["0 -1 0 5 1 0 0 5 0 0 1 0", "0 -1 0 5 1 0 0 25 0 0 1 0"]
+    (log / "sequences" / "00" / "poses.txt").write_text("\n".join(rows))
+    picture = tmp_path / "scene.png"
+    result = run("draw", log, "--labels", labels, "--out", picture, "--whole-scene", "--radius", 15, "--pixels", 400)
+    assert result.exit_code == 0, result.output
+    columns = np.nonzero((map_of(picture) == VOID).all(axis=2))[1] / 8 - 15
+    assert (columns.min(), columns.max()) == pytest.approx((20, 30), abs=0.5)
+
+
 @pytest.mark.parametrize(
     ("by", "car", "road"),
     [

@@ -11,15 +11,15 @@ from l3ps.drivelog.types import Points, Scan, Scene
 
 @pytest.fixture(scope="session")
 def make_scene() -> Callable[..., Scene]:
-    """``make_scene(name, tokens)``: a scene of scans without points or cameras."""
+    """``make_scene(name, tokens)``: a scene of scans without points or cameras, numbered if asked."""
 
-    def make(name: str, tokens: Sequence[str]) -> Scene:
+    def make(name: str, tokens: Sequence[str], numbers: Sequence[str] | None = None) -> Scene:
         empty = Points(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
         return Scene(
             name,
             tuple(
-                Scan(token, i, i, Path(f"{i}.bin"), np.eye(4), None, (), load_points=lambda: empty)
-                for i, token in enumerate(tokens)
+                Scan(token, i, i, Path(f"{i}.bin"), np.eye(4), None, (), lambda: empty, number=number)
+                for i, (token, number) in enumerate(zip(tokens, numbers or [None] * len(tokens), strict=True))
             ),
         )
 

@@ -44,6 +44,16 @@ def test_sequences_keep_equal_tokens_apart(make_scene, tmp_path):
         folder.read(other, other.scans[0])
 
 
+def test_scans_of_numbered_logs_keep_their_numbers(make_scene, tmp_path):
+    scenes = [make_scene(name, [f"{name}_000007"], ["000007"]) for name in ("00", "08")]
+    for cls, scene in zip((4, 10), scenes, strict=True):
+        (file,) = write_scene(tmp_path, "semantickitti", scene, [labels(f"{scene.name}_000007", cls=cls)])
+        assert file == tmp_path / "sequences" / scene.name / "predictions" / "000007.label"
+        write_scene(tmp_path / "npz", "nuscenes", scene, [labels(f"{scene.name}_000007", cls=cls)])
+    for folder in (open_labels(tmp_path, "semantickitti"), open_labels(tmp_path / "npz")):
+        assert [int(read_scan(folder, None, s, s.scans[0]).semantic[0]) for s in scenes] == [4, 10]
+
+
 def test_predictions_win_over_the_truth_beside_them(scene, tmp_path):
     (made,) = write_scene(tmp_path, "semantickitti", scene, [labels("a", cls=10)])
     truth = made.parent.parent / "labels" / "a.label"

@@ -1,0 +1,31 @@
+"""The commands there are, and that those which only talk to a service start without the method's packages."""
+
+import subprocess
+import sys
+
+from typer.testing import CliRunner
+
+from l3ps_cli.main import COMMANDS, app
+
+
+def test_help_lists_every_command_with_what_it_does():
+    text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).stdout
+    lines = {words[1]: words[2:] for line in text.splitlines() if len(words := line.split()) > 3}
+    for name in COMMANDS:
+        assert name in lines, text
+
+
+def test_an_unknown_command_is_a_usage_error():
+    result = CliRunner().invoke(app, ["lable"])
+    assert result.exit_code == 2 and "lable" in result.stderr
+
+
+def test_service_commands_do_not_import_the_method():
+    code = (
+        "import sys; from typer.testing import CliRunner; from l3ps_cli.main import app\n"
+        "for name in ('up', 'submit', 'jobs', 'download'): CliRunner().invoke(app, [name, '--help'])\n"
+        "heavy = ('onnxruntime', 'scipy', 'cv2', 'hdbscan', 'kiss_icp', 'celery')\n"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
