@@ -46,9 +46,9 @@ def test_any_name_becomes_a_valid_key_segment(name: str) -> None:
     assert "/" not in segment(name)
 
 
-@given(st.text(max_size=20), st.text(max_size=20))
-def test_different_names_give_different_segments(a: str, b: str) -> None:
-    assert (segment(a) == segment(b)) == (a == b)
+@given(st.text(max_size=20), st.text(max_size=20), st.sampled_from(["", "long" * 60]))
+def test_different_names_give_different_segments(a: str, b: str, before: str) -> None:
+    assert (segment(before + a) == segment(before + b)) == (a == b)
 
 
 def test_plain_names_stay_readable() -> None:
