@@ -13,6 +13,7 @@ from typing import Any, cast
 import redis
 from celery import Celery
 from celery.exceptions import OperationalError as CeleryOperationalError
+from kombu.entity import Exchange
 from kombu.entity import Queue as KombuQueue
 from kombu.exceptions import OperationalError as KombuOperationalError
 
@@ -49,7 +50,7 @@ def make_app(settings: Settings) -> Celery:
         visibility_timeout=_VISIBILITY_SECONDS,
         broker_connection_retry_on_startup=True,
         broker_connection_max_retries=None,  # a worker waits for Redis however long it takes
-        task_queues=[KombuQueue(name.value) for name in QueueName],  # type: ignore[no-untyped-call]
+        task_queues=[KombuQueue(name.value, Exchange(name.value), routing_key=name.value) for name in QueueName],  # type: ignore[no-untyped-call]
         task_default_queue=QueueName.REFINE.value,
         task_create_missing_queues=False,
         task_serializer="json",

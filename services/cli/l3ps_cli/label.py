@@ -151,6 +151,7 @@ def _checked(drive: Drive, skip_bad_scans: bool) -> Drive:
 def _all_or_nothing(target: Path) -> Iterator[Path]:
     """A folder to write to that replaces the parts of ``target`` only when the block ends well."""
     staging = target / ".partial"
+    is_new = not target.exists()
     try:
         shutil.rmtree(staging, ignore_errors=True)
         staging.mkdir(parents=True)
@@ -164,6 +165,10 @@ def _all_or_nothing(target: Path) -> Iterator[Path]:
             if old.is_dir():
                 shutil.rmtree(old)
             (staging / part).replace(old)
+    except BaseException:
+        if is_new:
+            shutil.rmtree(target, ignore_errors=True)
+        raise
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 

@@ -82,6 +82,8 @@ def main() -> None:
 
     network = train(known, len(CLASSES), settings, report=report)
     scores = intersection_over_union(network, unseen, len(CLASSES), settings.size)
+    learnt = intersection_over_union(network, known, len(CLASSES), settings.size)
+    _say(f"mean IoU on the training images themselves {np.nanmean(learnt):.1f}")
     difference = export(network, arguments.out, NAME, settings.size, THRESHOLD)
     recipe: dict[str, Any] = {
         "name": NAME,

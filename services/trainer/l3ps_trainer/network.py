@@ -90,15 +90,8 @@ class PanopticNet(nn.Module):
         self.semantic = nn.Conv2d(fine, classes, 1)
         self.boundary = nn.Sequential(nn.Conv2d(fine, 4, 1), nn.PixelShuffle(2))
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Label images.
-
-        Args:
-            image: (B, 3, H, W) normalised; H and W multiples of 16.
-
-        Returns:
-            (B, C, H, W) class logits and (B, 1, H, W) probability of lying inside a segment.
-        """
+    def heads(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`forward`, but the logits at half the input's resolution, which is where they are made."""
         half = self.stem(image)
         quarter = self.quarter(half)
         eighth = self.eighth(quarter)
@@ -108,4 +101,16 @@ class PanopticNet(nn.Module):
         x = self.smooth[0](_doubled(x) + self.laterals[1](eighth))
         x = self.smooth[1](_doubled(x) + self.laterals[2](quarter))
         x = self.last(_doubled(self.narrow(x)) + self.detail(half))
-        return _doubled(self.semantic(x)), torch.sigmoid(self.boundary(x))
+        return self.semantic(x), torch.sigmoid(self.boundary(x))
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Label images.
+
+        Args:
+            image: (B, 3, H, W) normalised; H and W multiples of 16.
+
+        Returns:
+            (B, C, H, W) class logits and (B, 1, H, W) probability of lying inside a segment.
+        """
+        semantic, boundary = self.heads(image)
+        return _doubled(semantic), boundary

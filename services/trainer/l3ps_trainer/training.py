@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -32,7 +33,7 @@ class Recipe:
         seed: of initial weights and views.
     """
 
-    steps: int = 1200
+    steps: int = 2000
     batch: int = 4
     crop: tuple[int, int] = (208, 368)
     size: tuple[int, int] = (288, 512)
@@ -43,16 +44,43 @@ class Recipe:
     seed: int = 1
 
 
-def hard_cross_entropy(logits: Tensor, classes: Tensor, share: float) -> Tensor:
+def hard_cross_entropy(logits: Tensor, classes: Tensor, share: float, weights: Tensor | None = None) -> Tensor:
     """Mean cross-entropy over the hardest share of all labelled pixels of the batch.
 
     Args:
         logits: (B, C, H, W).
         classes: (B, H, W) int64, 0 ignored.
         share: 0..1.
+        weights: (C,) of the classes, or None for equal ones.
     """
-    loss = f.cross_entropy(logits, classes, ignore_index=IGNORED, reduction="none")[classes != IGNORED]
+    loss = f.cross_entropy(logits, classes, weights, ignore_index=IGNORED, reduction="none")[classes != IGNORED]
     return loss.topk(max(1, int(share * loss.numel()))).values.mean()
+
+
+def class_weights(images: Sequence[Annotated], classes: int) -> Tensor:
+    """(C,) weights that lift rare classes without letting them drown the rest: (median share / share) ** 0.4."""
+    counts = sum(np.bincount(image.semantic.ravel(), minlength=classes)[:classes] for image in images)
+    share = np.maximum(np.asarray(counts, np.float64) / np.sum(counts), 1e-5)
+    weights = np.clip((np.median(share[1:]) / share) ** 0.4, 0.4, 4.0)
+    return torch.from_numpy(weights.astype(np.float32))
+
+
+def _views(images: Sequence[Annotated], recipe: Recipe) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Batches of random views, every image as often as any other; made one ahead in a thread of their own."""
+    rng = np.random.default_rng(recipe.seed)
+    unit = recipe.size[0] / images[0].semantic.shape[0]
+    order: list[int] = []
+
+    def draw() -> tuple[Tensor, Tensor, Tensor]:
+        while len(order) < recipe.batch:
+            order.extend(int(i) for i in rng.permutation(len(images)))
+        return batch([augmented(images[order.pop(0)], recipe.crop, unit, rng) for _ in range(recipe.batch)])
+
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        ahead = pool.submit(draw)
+        for _ in range(recipe.steps):
+            ready, ahead = ahead.result(), pool.submit(draw)
+            yield ready
 
 
 def train(
@@ -60,6 +88,9 @@ def train(
     report: Callable[[int, float], None] = lambda step, loss: None,
 ) -> PanopticNet:  # fmt: skip
     """Train a network from scratch; the same arguments give the same weights on the same machine.
+
+    The share of pixels that count shrinks from all to the hardest during the first half: mined from the start, a
+    network without pretrained weights learns little.
 
     Args:
         images: what is known.
@@ -69,19 +100,14 @@ def train(
         report: called with step and loss after each step.
     """
     torch.manual_seed(recipe.seed)
-    rng = np.random.default_rng(recipe.seed)
     network = PanopticNet(classes, width).train().to(memory_format=torch.channels_last)  # halves the time on CPUs
     optimiser = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.rate, total_steps=recipe.steps, pct_start=0.1)
-    unit = recipe.size[0] / images[0].semantic.shape[0]
-    order: list[int] = []
-    for step in range(recipe.steps):
-        while len(order) < recipe.batch:
-            order += [int(i) for i in rng.permutation(len(images))]
-        chosen, order = order[: recipe.batch], order[recipe.batch :]
-        inputs, targets, edges = batch([augmented(images[i], recipe.crop, unit, rng) for i in chosen])
-        semantic, inside = network(inputs.to(memory_format=torch.channels_last))
-        loss = hard_cross_entropy(semantic, targets, recipe.hardest)
+    weights = class_weights(images, classes)
+    for step, (inputs, targets, edges) in enumerate(_views(images, recipe)):
+        semantic, inside = network.heads(inputs.to(memory_format=torch.channels_last))
+        share = max(recipe.hardest, 1 - 2 * step / recipe.steps * (1 - recipe.hardest))
+        loss = hard_cross_entropy(semantic, targets[:, ::2, ::2], share, weights)
         loss = loss + recipe.boundary_weight * f.binary_cross_entropy(inside[:, 0], edges)
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import signal
@@ -105,6 +106,7 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
 @signals.worker_init.connect  # type: ignore[untyped-decorator]
 def _bury_predecessors(**_: Any) -> None:
     """In the main process at its start: what a worker held that was killed on this machine is free at once."""
+    atexit.register(_give_back_rest)  # the signal worker_shutdown is not sent when SIGQUIT ends the worker
     retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
     with _briefly() as tx:
         for stage_id, owner in stages.owned(tx.session, f"{socket.gethostname()}:"):
@@ -113,9 +115,10 @@ def _bury_predecessors(**_: Any) -> None:
                 workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner)
 
 
-@signals.worker_shutdown.connect  # type: ignore[untyped-decorator]
-def _give_back_rest(**_: Any) -> None:
+def _give_back_rest() -> None:
     """In the main process at its end: what a child held that was killed in mid-stage by our own shutdown."""
+    if os.getpid() != _main_pid:
+        return
     with _briefly() as tx:
         workflow.release_owned(tx, owner_prefix(_main_pid))
 

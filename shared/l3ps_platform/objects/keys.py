@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import mimetypes
 import re
 
@@ -51,13 +52,15 @@ def check_prefix(prefix: str) -> str:
 def segment(name: str) -> str:
     """A foreign name (a token, a file name) as one key segment; different names stay different.
 
-    Every byte outside the safe set becomes ``=XX``; names too long for a file system keep their beginning and their
-    length is cut, so callers that need uniqueness put an id before them.
+    Every byte outside the safe set becomes ``=XX``; names too long for a file system keep their beginning and get a
+    digest for the rest.
     """
     quoted = _UNSAFE.sub(lambda m: "".join(f"={byte:02X}" for byte in m[0].encode()), name)
     if not quoted or quoted[0] in ".-":
         quoted = f"={ord(quoted[0]):02X}{quoted[1:]}" if quoted else "=00"
-    return quoted[:MAX_SEGMENT]
+    if len(quoted) > MAX_SEGMENT:
+        quoted = f"{quoted[: MAX_SEGMENT - 40]}={hashlib.sha256(name.encode()).hexdigest()[:39]}"
+    return quoted
 
 
 def content_type(key: str) -> str:

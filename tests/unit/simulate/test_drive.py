@@ -55,10 +55,14 @@ def test_chains_are_closed_and_in_time_order(tables):
     for name in ("sample", "sample_data", "sample_annotation"):
         rows = {row["token"]: row for row in tables[name]}
         for row in rows.values():
+            if row["prev"]:
+                assert rows[row["prev"]]["next"] == row["token"]
             if row["next"]:
                 assert rows[row["next"]]["prev"] == row["token"]
                 if "timestamp" in row:
                     assert rows[row["next"]]["timestamp"] > row["timestamp"]
+    assert sum(row["prev"] == "" for row in tables["sample"]) == 1
+    assert sum(row["prev"] == "" for row in tables["sample_data"]) == 7
     for row in tables["instance"]:
         chain = [row["first_annotation_token"]]
         rows = {r["token"]: r for r in tables["sample_annotation"]}

@@ -3,6 +3,7 @@
 import numpy as np
 
 from l3ps.simulate.lidar import BEAMS, MAX_RANGE, sweep
+from l3ps.simulate.street import meet_ground
 
 
 def test_some_returns_are_lost_and_more_of_them_far_away(world):
@@ -42,6 +43,15 @@ def test_the_ground_is_where_the_wheels_are(world):
     road = (scan.raw == 24) & (np.linalg.norm(scan.points[:, :2], axis=1) < 10)
     assert road.sum() > 2000
     assert abs(np.median(scan.points[road, 2]) + 1.84) < 0.05
+
+
+def test_nothing_floats_and_nothing_sinks(world):
+    """Straight down from above an object the ground lies where the object stands."""
+    for time in (0.0, 5.0):
+        for pose in world.poses(time):
+            above = np.array([*pose[:2, 3], 9.0])
+            depth = meet_ground(world.street, above, np.array([[0.0], [0.0], [-1.0]], np.float32)).depth[0]
+            assert abs(9.0 - depth - pose[2, 3]) < 1e-4
 
 
 def test_crowds_give_panoptic_evaluation_something_to_do(world):

@@ -56,3 +56,13 @@ def write_bundle(tmp_path):
     write.graph = colour_graph
     write.description = description
     return write
+
+
+@pytest.fixture(scope="session")
+def small_drive(tmp_path_factory):
+    """A simulated drive of one scene with two scans; tests must not change it."""
+    from l3ps.simulate import simulate_drive
+
+    folder = tmp_path_factory.mktemp("simulated") / "drive"
+    simulate_drive(folder, scenes=1, scans=2, seed=3)
+    return folder

@@ -1,0 +1,95 @@
+"""Real Celery workers on a real Redis, killed in every way."""
+
+import hashlib
+import os
+import signal
+from pathlib import Path
+
+import httpx
+import pytest
+
+from l3ps_platform.catalog import JobState, StageName, StageState
+
+pytestmark = pytest.mark.services
+
+
+def at_work(bench, job: str, attempt: int = 1):
+    """The job's segment stage that is running at this attempt and has reported, or None."""
+    running = (s for s in bench.stages(job) if s.name is StageName.SEGMENT and s.state is StageState.RUNNING)
+    return next((s for s in running if s.attempt == attempt and s.progress_done), None)
+
+
+def child_of(stage) -> int:
+    return int(stage.lease_owner.rpartition(":")[2])
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_two_workers_on_postgresql_and_minio(
+    served, worker, drive_zip: Path, fast_model: Path, postgres_url: str, s3_url: str
+) -> None:
+    """One for each queue; the files come back through presigned URLs."""
+    with served(database_url=postgres_url, objects_url=s3_url) as bench:
+        worker(bench, "segment")
+        worker(bench, "refine")
+        drive, _ = bench.upload_drive(drive_zip), bench.upload_model(fast_model)
+        job = bench.finished(bench.submit(drive, preset="fast"))
+        assert (job.state, job.error) == (JobState.SUCCEEDED, None)
+        assert job.quality["protocol"] == "nuscenes"
+        file = next(f for f in bench.manifest(job.id)["files"] if f["path"].startswith("refined/panoptic"))
+        reply = httpx.get(bench.store.presign_get(file["key"], 60))
+        assert hashlib.sha256(reply.content).hexdigest() == file["sha256"]
+
+
+def test_a_job_survives_all_that_can_happen_to_its_workers(served, worker, short_zip: Path, slow_model: Path) -> None:
+    """One scene, met at work four times: its child is killed, its worker is told to stop, gently and less so, and at
+    last killed. The lease of two minutes is never waited for, and only the two kills count as attempts.
+    """
+    with served() as bench:
+        current = worker(bench)
+        drive, _ = bench.upload_drive(short_zip), bench.upload_model(slow_model)
+        job = bench.submit(drive, preset="fast")
+
+        os.kill(child_of(bench.until(lambda: at_work(bench, job, attempt=1))), signal.SIGKILL)
+        for stop in (signal.SIGTERM, signal.SIGQUIT):
+            stage = bench.until(lambda: at_work(bench, job, attempt=2))
+            current.send_signal(stop)
+            current.wait(30)
+            given_back = next(s for s in bench.stages(job) if s.id == stage.id)
+            assert (given_back.state, given_back.attempt) == (StageState.QUEUED, 2), stop.name
+            assert not alive(child_of(stage))
+            current = worker(bench)
+
+        stage = bench.until(lambda: at_work(bench, job, attempt=2))
+        current.kill()
+        current.wait()
+        bench.until(lambda: not alive(child_of(stage)))
+        worker(bench)
+        assert bench.finished(job).state is JobState.SUCCEEDED
+        assert next(s for s in bench.stages(job) if s.id == stage.id).attempt == 3
+
+
+def test_a_cancelled_job_stops_in_a_real_worker(served, worker, short_zip: Path, slow_model: Path) -> None:
+    with served() as bench:
+        worker(bench)
+        drive, _ = bench.upload_drive(short_zip), bench.upload_model(slow_model)
+        job = bench.submit(drive, preset="fast")
+        bench.until(lambda: at_work(bench, job))
+        bench.cancel(job)
+        assert bench.finished(job).state is JobState.CANCELLED
+
+
+def test_a_stage_that_takes_too_long_is_stopped_with_that_reason(
+    served, worker, short_zip: Path, stuck_model: Path
+) -> None:
+    with served(stage_seconds=3.0, max_attempts=1) as bench:
+        worker(bench)
+        drive, _ = bench.upload_drive(short_zip), bench.upload_model(stuck_model)
+        job = bench.finished(bench.submit(drive, preset="fast"))
+        assert job.state is JobState.FAILED
+        assert "ran for more than 3 s" in job.error["message"]

@@ -1,0 +1,128 @@
+"""``l3ps label``, ``l3ps bench`` and ``l3ps simulate`` as a user calls them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from l3ps.drivelog import open_drive
+from l3ps.labels import open_labels, read_poses
+from l3ps_cli.main import app
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def files_under(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def bundle(write_bundle):
+    return write_bundle()
+
+
+def test_a_drive_gets_labels_poses_and_a_report(small_drive, bundle, tmp_path):
+    out, report = tmp_path / "out", tmp_path / "reports" / "run.json"
+    result = run("label", small_drive, "--model", bundle, "--out", out, "--report", report, "--preset", "paper")
+    assert result.exit_code == 0, result.output
+    assert "mean" in result.stdout
+    drive = open_drive(small_drive)
+    (scene,) = drive.scenes
+    for side in ("primal", "refined"):
+        folder = open_labels(out / side)
+        for scan in scene.scans:
+            semantic, _ = folder.read(scene, scan, "nuscenes")
+            assert len(semantic) == len(scan.load_points())
+            assert semantic.any()
+    assert list(read_poses(out)) == [scan.token for scan in scene.scans]
+    summary = json.loads(report.read_text())
+    assert summary["preset"]["name"] == "paper"
+    assert set(summary["quality"]) == {"primal", "refined"}
+    assert set(summary["scenes"][0]["stages"]) == {"segment", "accumulate", "ground", "cluster", "vote", "instances"}
+    assert summary["scenes"][0]["points"] == sum(len(scan.load_points()) for scan in scene.scans)
+
+
+def test_the_same_input_gives_the_same_bytes(small_drive, bundle, tmp_path):
+    for name in ("a", "b"):
+        assert run("label", small_drive, "--model", bundle, "--out", tmp_path / name).exit_code == 0
+    assert files_under(tmp_path / "a") == files_under(tmp_path / "b")
+
+
+def test_a_second_run_replaces_the_first(small_drive, bundle, tmp_path):
+    for label_format in ("nuscenes", "semantickitti"):
+        result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o", "--format", label_format)
+        assert result.exit_code == 0, result.output
+    assert not list((tmp_path / "o").rglob("*.npz"))
+    assert len(list((tmp_path / "o" / "refined").rglob("*.label"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--preset", "great"), "there is no 'great'"),
+        (("--format", "coco"), "there is no 'coco'"),
+        (("--scene", "scene-99"), "no scene 'scene-99'"),
+        (("--model", "nowhere"), "there is no such file or directory"),
+    ],
+)
+def test_a_wrong_option_is_one_sentence_and_leaves_nothing(small_drive, bundle, tmp_path, options, expected):
+    result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o", *options)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+    assert "Traceback" not in result.output
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.fixture
+def spoilt_drive(small_drive, tmp_path):
+    """The second scan is cut short."""
+    copy = tmp_path / "spoilt"
+    shutil.copytree(small_drive, copy)
+    scan = open_drive(copy).scenes[0].scans[1]
+    scan.path.write_bytes(scan.path.read_bytes()[:-3])
+    return copy, scan
+
+
+def test_a_bad_scan_is_named_and_stops_the_run_unless_asked(spoilt_drive, bundle, tmp_path):
+    drive, scan = spoilt_drive
+    out = tmp_path / "o"
+    refused = run("label", drive, "--model", bundle, "--out", out)
+    assert refused.exit_code == 2
+    assert scan.path.name in refused.stderr
+    assert not out.exists()
+    kept = run("label", drive, "--model", bundle, "--out", out, "--skip-bad-scans")
+    assert kept.exit_code == 0, kept.output
+    assert scan.path.name in kept.stderr
+    assert len(list((out / "refined" / "panoptic").iterdir())) == 1
+
+
+def test_what_was_there_survives_a_failed_run(small_drive, spoilt_drive, bundle, tmp_path):
+    out = tmp_path / "o"
+    assert run("label", small_drive, "--model", bundle, "--out", out).exit_code == 0
+    before = files_under(out)
+    assert run("label", spoilt_drive[0], "--model", bundle, "--out", out).exit_code == 2
+    assert files_under(out) == before
+
+
+def test_bench_tells_every_stage_and_its_peers(small_drive):
+    result = run("bench", "refine", "--log", small_drive, "--scans", 1, "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["scans"] == 1
+    assert set(figures["stages"]) == {"accumulate", "ground", "cluster", "vote", "instances"}
+    assert all(cost["seconds"] >= 0 and cost["peak_mb"] > 10 for cost in figures["stages"].values())
+    assert figures["clustering"]["hdbscan"] > 0
+
+
+def test_simulate_makes_a_drive_and_touches_no_folder_in_use(tmp_path):
+    result = run("simulate", "--scans", 1, "--seed", 4, "--out", tmp_path / "new")
+    assert result.exit_code == 0, result.output
+    scan = open_drive(tmp_path / "new").scenes[0].scans[0]
+    assert np.isfinite(scan.load_points().xyz).all()
+    again = run("simulate", "--out", tmp_path / "new")
+    assert again.exit_code == 2
+    assert "not an empty folder" in again.stderr

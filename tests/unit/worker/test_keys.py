@@ -1,0 +1,82 @@
+"""Content-addressed keys: equal for equal work, different for different work."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from l3ps.presets import PRESETS
+from l3ps_worker import keys
+
+BEST = PRESETS["best"]
+
+
+def segment(**changes) -> str:
+    given = {"drive_sha256": "d", "model_sha256": "m", "scene": "s", "preset": BEST, "skip": False} | changes
+    skip = given.pop("skip")
+    return keys.segment_key(**given, skip=skip)
+
+
+def refine(**changes) -> str:
+    given = {"primal_key": "p", "preset": BEST, "formats": ["nuscenes"], "protocol": "nuscenes"} | changes
+    return keys.refine_key(**given)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"drive_sha256": "x"},
+        {"model_sha256": "x"},
+        {"scene": "x"},
+        {"skip": True},
+        {"preset": replace(BEST, min_area=0.5)},
+    ],
+)
+def test_segment_keys_tell_inputs_apart(change) -> None:
+    assert segment() == segment()
+    assert segment(**change) != segment()
+
+
+def test_primal_labels_serve_every_refinement() -> None:
+    assert segment(preset=replace(BEST, instance_gap=9.0)) == segment()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"primal_key": "x"},
+        {"preset": replace(BEST, instance_gap=9.0)},
+        {"formats": ["semantickitti"]},
+        {"protocol": "paper"},
+    ],
+)
+def test_refine_keys_tell_inputs_apart(change) -> None:
+    assert refine() == refine()
+    assert refine(**change) != refine()
+
+
+def test_the_order_of_formats_does_not_matter() -> None:
+    assert refine(formats=["a", "b"]) == refine(formats=["b", "a"])
+
+
+def test_a_changed_vote_rule_refines_anew_from_the_same_primal_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("segment/session.py", "refine/vote.py", "simulate/world.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("before")
+    monkeypatch.setattr(keys, "_ROOT", tmp_path)
+
+    def both() -> tuple[str, str]:
+        keys.code_version.cache_clear()
+        return segment(), refine()
+
+    before = both()
+    (tmp_path / "simulate/world.py").write_text("after")
+    assert both() == before
+    (tmp_path / "refine/vote.py").write_text("after")
+    changed = both()
+    assert changed[0] == before[0] and changed[1] != before[1]
+    (tmp_path / "segment/session.py").write_text("after")
+    assert both()[0] != before[0]
+    keys.code_version.cache_clear()
