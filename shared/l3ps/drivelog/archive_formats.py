@@ -6,6 +6,7 @@ a crafted archive uses to fill it. Headers are decoded by the documented :meth:`
 
 from __future__ import annotations
 
+import errno
 import stat
 import struct
 import tarfile
@@ -18,6 +19,17 @@ from typing import BinaryIO, Final, Literal
 Kind = Literal["zip", "tar", "tar.gz", "tar.zst"]
 CHUNK: Final = 1 << 20
 _BLOCK: Final = 512
+_ZIP_DAMAGE: Final = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    ValueError,
+    OverflowError,
+)
+"""All that zipfile lets out when bytes are wrong."""
 _LONGEST_HEADER: Final = 1 << 20
 """Bytes of a tar extended header; real ones hold a path and a few times."""
 
@@ -89,12 +101,12 @@ def zip_members(file: BinaryIO, size: int, max_files: int) -> Iterator[Member]:
         raise ArchiveFault("too-many-files", f"it has more than {max_files} members")
     try:
         archive = zipfile.ZipFile(file)
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error, OSError) as error:
+    except (*_ZIP_DAMAGE, OSError) as error:
         raise ArchiveFault("corrupt-archive", f"it is corrupt ({error})") from error
     with archive:
         for info in archive.infolist():
             _check_zip(info)
-            yield Member(info.filename, info.is_dir(), _ZipContent(archive, info))
+            yield Member(info.filename, info.filename.endswith("/"), _ZipContent(archive, info))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +119,12 @@ class _ZipContent:
             with self.archive.open(self.info) as member:
                 while chunk := member.read(CHUNK):
                     yield chunk
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error) as error:
+        except _ZIP_DAMAGE as error:
             raise ArchiveFault("corrupt-archive", f"it is corrupt ({error})", self.info.filename) from error
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # what seeking to an offset before the file's start gives
+                raise
+            raise ArchiveFault("corrupt-archive", "it is corrupt: a member lies nowhere", self.info.filename) from error
 
 
 def _check_zip(info: zipfile.ZipInfo) -> None:

@@ -242,7 +242,7 @@ def in_order(rows: list[Row]) -> tuple[list[Row], bool]:
     while row is not None and len(chain) < len(rows):
         chain.append(row)
         row = by_token.get(row["next"] or "")
-    if len(chain) == len(rows) == len({r["token"] for r in chain}):
+    if len({r["token"] for r in chain}) == len(rows):  # neither broken nor a circle
         return chain, True
     return sorted(rows, key=lambda r: int(r["timestamp"])), False
 

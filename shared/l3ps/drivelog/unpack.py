@@ -162,7 +162,7 @@ def opened(
     if scratch is not None:
         scratch.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="drive-", dir=scratch) as folder:
-        root = unpack(path, Path(folder) / "log", limits, progress=progress)
+        root = unpack(path, Path(folder) / path.name, limits, progress=progress)  # its name is what messages show
         yield open_drive(root, sweeps=sweeps, skip_bad_scans=skip_bad_scans)
 
 

@@ -74,6 +74,25 @@ def test_scans_follow_the_links_not_the_table(nuscenes_log):
     assert [s.token for s in open_drive(log.root).scenes[0].scans] == [f"LIDAR_TOP-0-{i}-0" for i in range(3)]
 
 
+def test_sweeps_follow_their_links_too(nuscenes_log):
+    """In nuScenes a sweep belongs to the keyframe it is closest to, so it may come before it."""
+    log = nuscenes_log(scans=2, sweeps=2)
+    for row in log.tables["sample_data"]:
+        if row["token"] == "LIDAR_TOP-0-0-2":
+            row["sample_token"] = "k0-1"
+    log.tables["sample_data"].reverse()
+    scans = open_drive(log.save(), sweeps=True).scenes[0].scans
+    assert [s.token[-3:] for s in scans] == ["0-0", "0-1", "0-2", "1-0", "1-1", "1-2"]
+
+
+def test_a_broken_link_loses_no_scan(nuscenes_log):
+    log = nuscenes_log(scans=4)
+    log.tables["sample"][1]["next"] = "nowhere"
+    drive = open_drive(log.save())
+    assert [s.token for s in drive.scenes[0].scans] == [f"LIDAR_TOP-0-{i}-0" for i in range(4)]
+    assert [p.code for p in drive.problems] == ["broken-links"]
+
+
 def test_without_links_time_decides_and_a_warning_says_so(nuscenes_log):
     log = nuscenes_log()
     log.tables["sample"].reverse()

@@ -44,6 +44,12 @@ def test_of_several_versions_one_must_be_named(logs):
     assert len(open_drive(root / "v1.0-test").scenes) == 1
 
 
+def test_folder_of_a_version_without_tables_does_not_count(logs):
+    """Archives of single parts leave such folders behind, e.g. with maps only."""
+    (logs["nuscenes"] / "v1.0-test").mkdir()
+    assert len(open_drive(logs["nuscenes"]).scenes) == 1
+
+
 def test_no_log_says_what_was_looked_for(tmp_path):
     (tmp_path / "images").mkdir()
     with pytest.raises(DriveLogError) as caught:

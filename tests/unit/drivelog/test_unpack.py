@@ -276,14 +276,21 @@ def test_zip_whose_headers_lie_about_sizes(place):
     assert place.refused(bytes(content), BOMB_LIMITS)[0] in {"corrupt-archive", "archive-bomb"}
 
 
-def test_zip_whose_members_share_their_data(place):
-    """Many directory entries over one block of data: a small file, no nesting, and a great deal of output."""
+def many_entries(count: int) -> bytes:
+    """A zip whose directory names one member many times over."""
     one = zipped({"log/z0": b"\0" * 900_000})
     start = one.find(b"PK\x01\x02")
-    data, entry, end = one[:start], one[start:-22], one[-22:]
-    entries = entry * 50
-    end = end[:8] + struct.pack("<HHII", 50, 50, len(entries), start) + end[20:]
-    assert place.refused(data + entries + end, BOMB_LIMITS)[0] in {"duplicate-path", "archive-bomb", "corrupt-archive"}
+    entries = one[start:-22] * count
+    return one[:start] + entries + one[-22:-14] + struct.pack("<HHII", count, count, len(entries), start) + one[-2:]
+
+
+def test_zip_whose_members_share_their_data(place):
+    """A small file, no nesting, and a great deal of output."""
+    assert place.refused(many_entries(50), BOMB_LIMITS)[0] in {"duplicate-path", "archive-bomb", "corrupt-archive"}
+
+
+def test_entries_are_counted_before_they_are_held(place):
+    assert place.refused(many_entries(50), UnpackLimits(max_files=49))[0] == "too-many-files"
 
 
 @pytest.mark.parametrize("kind", ["zip", "gz", "zst", "pax"])
@@ -339,6 +346,21 @@ def test_not_an_archive(place, content, says):
     _, message = place.refused(content)
     assert re.search(says, message)
     assert message.startswith("upload: ")
+
+
+def test_zip_members_that_lie_before_the_file(place):
+    """A wrong offset of the directory makes every member's place negative."""
+    content = bytearray(WHOLE["zip"])
+    struct.pack_into("<I", content, len(content) - 6, len(content) * 2)
+    assert place.refused(bytes(content))[0] == "corrupt-archive"
+
+
+def test_zip_member_without_a_name(place):
+    content = bytearray(zipped({"q": b"1"}))
+    at = content.find(b"PK\x01\x02")
+    struct.pack_into("<H", content, at + 28, 0)
+    struct.pack_into("<H", content, at + 30, 1)  # the name's byte becomes an extra field
+    assert place.refused(bytes(content))[0] in {"unsafe-path", "corrupt-archive"}
 
 
 def test_empty_archives(place):
@@ -441,6 +463,9 @@ def test_opened_archive_is_gone_afterwards(nuscenes_log, tmp_path):
 
 def test_opened_archive_is_gone_after_an_error(tmp_path):
     (tmp_path / "a.zip").write_bytes(zipped())
-    with pytest.raises(DriveLogError, match="no LiDAR log found"), opened(tmp_path / "a.zip", tmp_path / "scratch"):
+    with (
+        pytest.raises(DriveLogError, match=r"^a\.zip: no LiDAR log found"),
+        opened(tmp_path / "a.zip", tmp_path / "scratch"),
+    ):
         pass
     assert not list((tmp_path / "scratch").iterdir())
