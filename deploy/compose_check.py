@@ -25,6 +25,7 @@ from composecheck.images import provide
 from composecheck.stack import Stack
 
 SCANS, SEED = 6, 7
+MODEL = ROOT / "services" / "cli" / "l3ps_cli" / "models" / "demo"
 
 
 class Report:
@@ -141,7 +142,7 @@ def main() -> int:
     parser.add_argument("--offline", action="store_true", help="do not try to pull images: make stand-ins at once")
     parser.add_argument("--keep", action="store_true", help="leave the stack up until Ctrl-C")
     parser.add_argument("--drive", type=Path, help="a nuScenes drive to push through instead of a simulated one")
-    parser.add_argument("--model", default=str(ROOT / "models" / "demo"), help="the model bundle to label it with")
+    parser.add_argument("--model", default=str(MODEL), help="the model bundle to label it with")
     parser.add_argument("--engine-data", type=Path, help="where an engine of our own keeps its images for next time")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, interrupt)

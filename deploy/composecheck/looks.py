@@ -104,7 +104,7 @@ def labels(stack: Stack, job: str, drive: Path) -> str:
 
 def metrics(stack: Stack) -> str:
     """Prometheus has what the API computed from the catalog."""
-    wanted = ('up{job="l3ps"}', "sum(l3ps_stage_scans_total)")
+    wanted = ('up{job="l3ps"}', "sum(l3ps_scans_total)")
     deadline = time.monotonic() + SCRAPE_SECONDS
     while time.monotonic() < deadline:
         with suppress(OSError):
