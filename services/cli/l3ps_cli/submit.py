@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
@@ -99,6 +100,7 @@ def ensure_model(client: Client, model: str) -> str:
     """The name of a model that the service has; a bundle given by path is uploaded unless it is there already."""
     path = Path(model)
     if not (path.is_dir() or path.is_file()):
+        client.get(f"/models/{quote(model, safe='')}")  # an unknown name is said before a log is sent
         return model
     name = bundle_name(path)
     with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
