@@ -27,7 +27,7 @@ from l3ps.refine.accumulate import estimate_poses, transform
 from l3ps.refine.cluster import Clusterer, cluster_scene, hdbscan_package
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.instances import correct_instances, geometric_instances
-from l3ps.refine.vote import vote
+from l3ps.refine.vote import fill_unseen_ground, vote
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
@@ -125,6 +125,8 @@ def refine_scene(
 
     with book.span("vote"):
         semantic = vote(cluster, np.concatenate([labels.semantic for labels in primal]), preset.voting)
+        if preset.unseen_ground is not None:
+            semantic = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
         progress("vote", 1, 1)
 
     with book.span("instances"):

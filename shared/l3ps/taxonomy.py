@@ -29,6 +29,7 @@ class LabelSpace:
         classes: class names by index, ``classes[0] == "void"``.
         things: indices of the thing classes.
         rare: indices favoured by the vote, in the order in which the published code tries them.
+        ground: indices of the classes that are ground.
         colors: one RGB triple a class, the colours the field is used to.
     """
 
@@ -36,6 +37,7 @@ class LabelSpace:
     classes: tuple[str, ...]
     things: frozenset[int]
     rare: tuple[int, ...]
+    ground: frozenset[int]
     colors: tuple[tuple[int, int, int], ...] = field(repr=False)
 
     @cached_property
@@ -43,6 +45,13 @@ class LabelSpace:
         """(C,) bool, True where a class is a thing."""
         mask = np.zeros(len(self.classes), dtype=bool)
         mask[list(self.things)] = True
+        return mask
+
+    @cached_property
+    def is_ground(self) -> NDArray[np.bool_]:
+        """(C,) bool, True where a class is ground."""
+        mask = np.zeros(len(self.classes), dtype=bool)
+        mask[list(self.ground)] = True
         return mask
 
     @cached_property
@@ -78,6 +87,7 @@ NUSCENES16 = LabelSpace(
     ),
     things=frozenset(range(1, 11)),
     rare=(3, 5, 6, 9, 12, 13),
+    ground=frozenset({11, 12, 13, 14}),
     colors=(
         (0, 0, 0),
         (112, 128, 144),
@@ -197,6 +207,7 @@ SEMANTICKITTI19 = LabelSpace(
     ),
     things=frozenset(range(1, 9)),
     rare=(),
+    ground=frozenset({9, 10, 11, 12, 17}),
     colors=(
         (0, 0, 0),
         (100, 150, 245),
