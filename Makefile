@@ -40,8 +40,8 @@ $(CURDIR)/.tools/bin/uv:
 	$(PYTHON) -m venv $(CURDIR)/.tools
 	$(CURDIR)/.tools/bin/pip install --quiet 'uv>=0.9'
 
-compose-check: setup-dev ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
-	deploy/compose_check.sh
+compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
+	$(RUN) python deploy/compose_check.py
 
 demo-model: setup-dev ## train the demo's model again from simulated images
 	$(RUN) python -m l3ps_trainer.demo_model --out services/cli/l3ps_cli/models/demo

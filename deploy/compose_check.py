@@ -25,6 +25,7 @@ from composecheck.images import provide
 from composecheck.stack import Stack
 
 SCANS, SEED = 6, 7
+MODEL = ROOT / "services" / "cli" / "l3ps_cli" / "models" / "demo"
 
 
 class Report:
@@ -77,7 +78,7 @@ def check(report: Report, options: argparse.Namespace, work: Path) -> None:
         except BaseException:
             with suppress(CheckError):
                 say(stack.compose("ps", "--all"))
-                say(stack.compose("logs", "--no-color", "--tail", "25"))
+                say(stack.compose("logs", "--no-color", "--tail", "12"))
             raise
         if options.keep:
             say(f"Up at {stack.url} with L3PS_TOKEN={stack.settings['L3PS_TOKEN']} until Ctrl-C.")
@@ -141,7 +142,7 @@ def main() -> int:
     parser.add_argument("--offline", action="store_true", help="do not try to pull images: make stand-ins at once")
     parser.add_argument("--keep", action="store_true", help="leave the stack up until Ctrl-C")
     parser.add_argument("--drive", type=Path, help="a nuScenes drive to push through instead of a simulated one")
-    parser.add_argument("--model", default=str(ROOT / "models" / "demo"), help="the model bundle to label it with")
+    parser.add_argument("--model", default=str(MODEL), help="the model bundle to label it with")
     parser.add_argument("--engine-data", type=Path, help="where an engine of our own keeps its images for next time")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, interrupt)

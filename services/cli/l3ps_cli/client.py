@@ -44,12 +44,15 @@ class ServiceProblemError(Exception):
 
 
 def sentences(document: Document) -> list[str]:
-    """A problem document as sentences for a person: what is wrong, then each error with its remedy."""
-    lines = [str(document.get("detail") or document.get("title") or "The service refused the request.")]
+    """A problem document as sentences for a person: what is wrong, then each error that this did not say already."""
+    detail = str(document.get("detail") or document.get("title") or "The service refused the request.")
+    lines = [detail]
     for error in document.get("errors") or []:
-        where, what, remedy = (str(error.get(key) or "") for key in ("where", "what", "remedy"))
-        line = f"  {where}: {what}" if where else f"  {what}"
-        lines.append(f"{line.rstrip('.')}. {remedy}".rstrip())
+        where, what, remedy = (str(error.get(key) or "").rstrip(".") for key in ("where", "what", "remedy"))
+        if what and what in detail:
+            continue
+        line = f"  {where}: {what}." if where else f"  {what}."
+        lines.append(f"{line} {remedy}." if remedy else line)
     return lines
 
 

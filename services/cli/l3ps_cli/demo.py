@@ -17,7 +17,7 @@ from l3ps_cli.processes import ChildDiedError
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table, stage_table
 from l3ps_cli.stack import Stack, StackError, StackOptions
-from l3ps_cli.submit import create_job, ensure_model, job_failure, upload_log
+from l3ps_cli.submit import create_job, ensure_model, require_success, upload_log
 from l3ps_cli.up import StopRequested, stop_on_signals
 from l3ps_cli.watch import wait_for_job
 
@@ -68,8 +68,7 @@ def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str) -> d
     document = upload_log(client, log)
     job = create_job(client, document["id"], model=name, preset=preset)
     job = wait_for_job(client, job["id"], err, stack.check)
-    if job["state"] != "succeeded":
-        fail("\n".join(job_failure(job)), JOB_FAILED)
+    require_success(job)
     return job
 
 

@@ -41,7 +41,10 @@ def _list(documents: list[dict[str, Any]]) -> None:
     if not documents:
         out.print("No jobs yet: `l3ps submit LOG --model NAME` makes one.")
         return
-    table = Table("job", "drive", "model", "preset", "state", "done", "PQ", box=None)
+    table = Table(box=None)
+    table.add_column("job", min_width=29, no_wrap=True)  # an id is for copying, so it is never cut short
+    for name in ("drive", "model", "preset", "state", "done", "PQ"):
+        table.add_column(name)
     for job in documents:
         refined = (job.get("quality") or {}).get("refined") or {}
         table.add_row(

@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -131,7 +131,7 @@ def _limited(drive: Drive, scene: str | None) -> Drive:
         raise DriveLogError(
             Problem("unknown-scene", "--scene", f"the log has no scene '{scene}'", f"Its scenes are: {known}.")
         )
-    return Drive(drive.root, drive.format, chosen, drive.truth_space, drive.sensor_height)
+    return replace(drive, scenes=chosen)
 
 
 def _checked(drive: Drive, skip_bad_scans: bool) -> Drive:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 from l3ps.errors import DriveLogError, Problem
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
-from l3ps_cli.packing import ARCHIVE_SUFFIXES, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
+from l3ps_cli.packing import ARCHIVE_SUFFIXES, Report, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
 from l3ps_cli.watch import wait_for_job
 
 
@@ -57,8 +58,8 @@ def submit(
         out.print_json(data=job)
     else:
         out.print(f"job {job['id']}: {job['state']}", highlight=False)
-    if wait and job["state"] != "succeeded":
-        fail("\n".join(job_failure(job)), BAD_INPUT if job["drive"]["state"] == "rejected" else JOB_FAILED)
+    if wait:
+        require_success(job)
 
 
 def create_job(
@@ -85,17 +86,21 @@ def create_job(
     return client.post("/jobs", request)
 
 
-def job_failure(job: dict[str, Any]) -> list[str]:
-    """Why a job did not succeed, as sentences."""
+def require_success(job: dict[str, Any]) -> None:
+    """End the command with the reason and the exit code for it where a finished job did not succeed."""
     if job["state"] == "cancelled":
-        return [f"Job {job['id']} was cancelled."]
-    return sentences({"detail": f"Job {job['id']} failed. {job.get('message') or ''}", "errors": job.get("errors")})
+        fail(f"Job {job['id']} was cancelled.", JOB_FAILED)
+    if job["state"] == "failed":
+        why = {"detail": f"Job {job['id']} failed. {job.get('message') or ''}", "errors": job.get("errors")}
+        rejected = "rejected" in (job["drive"]["state"], job["model"]["state"])
+        fail("\n".join(sentences(why)), BAD_INPUT if rejected else JOB_FAILED)
 
 
 def ensure_model(client: Client, model: str) -> str:
     """The name of a model that the service has; a bundle given by path is uploaded unless it is there already."""
     path = Path(model)
     if not (path.is_dir() or path.is_file()):
+        client.get(f"/models/{quote(model, safe='')}")  # an unknown name is said before a log is sent
         return model
     name = bundle_name(path)
     with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
@@ -112,7 +117,7 @@ def ensure_model(client: Client, model: str) -> str:
         else:
             if known["sha256"] == sha256 and known["state"] != "rejected":
                 return name
-        with _bytes_bar("uploading the model", archive.stat().st_size) as advance:
+        with _bytes_bar("uploading the model", archive.stat().st_size) as (advance, _):
             client.upload(archive, "model", sha256, name, advance)
     return name
 
@@ -125,8 +130,8 @@ def upload_log(client: Client, log: Path) -> dict[str, Any]:
     if log.is_dir():
         with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
             archive = Path(scratch) / f"{log.resolve().name}.tar"
-            with _bytes_bar("packing", 0) as advance:
-                pack_log(log, archive, _since(advance))
+            with _bytes_bar("packing") as (_, report):
+                pack_log(log, archive, report)
             return _upload_archive(client, archive, log.resolve().name)
     if not log.is_file():
         what, remedy = "there is no such file or directory", "Name a drive log."
@@ -144,31 +149,23 @@ def upload_log(client: Client, log: Path) -> dict[str, Any]:
 
 def _upload_archive(client: Client, archive: Path, name: str) -> dict[str, Any]:
     size = archive.stat().st_size
-    with _bytes_bar("checksum", size) as advance:
-        sha256 = sha256_of(archive, _since(advance))
+    with _bytes_bar("checksum") as (_, report):
+        sha256 = sha256_of(archive, report)
     for drive in client.get("/drives", sha256=sha256)["items"]:
         if drive["state"] != "rejected":
             err.print(f"the service has this log already: {drive['id']}", highlight=False)
             return dict(drive)
-    with _bytes_bar("uploading", size) as advance:
+    with _bytes_bar("uploading", size) as (advance, _):
         return client.upload(archive, "drive", sha256, name, advance)
 
 
 @contextmanager
-def _bytes_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+def _bytes_bar(what: str, total: int | None = None) -> Iterator[tuple[Callable[[int], None], Report]]:
+    """A bar of bytes and the two ways to move it: by what is new, or by (done, total)."""
+    columns = (TextColumn("{task.description:<20}"), BarColumn(24), DownloadColumn(), TransferSpeedColumn())
     with Progress(*columns, console=err) as progress:
-        bar = progress.add_task(what, total=total or None)
-        yield lambda count: progress.advance(bar, count)
-
-
-def _since(advance: Callable[[int], None]) -> Callable[[int, int], None]:
-    """A (done, total) report that advances a bar by what is new."""
-    last = 0
-
-    def report(done: int, _total: int) -> None:
-        nonlocal last
-        advance(done - last)
-        last = done
-
-    return report
+        bar = progress.add_task(what, total=total)
+        yield (
+            lambda count: progress.advance(bar, count),
+            lambda done, whole: progress.update(bar, completed=done, total=whole),
+        )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
 from l3ps_cli.client import Client
 
@@ -29,9 +29,9 @@ def wait_for_job(
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[step]}", style="dim"),
+        TaskProgressColumn(),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[step]}", style="dim"),
     )
     with Progress(*columns, console=console) as progress:
         bars: dict[str, TaskID] = {}
@@ -61,13 +61,17 @@ def _show(progress: Progress, bars: dict[str, TaskID], label: str, stage: dict[s
     if stage["state"] in ("waiting", "queued") and label not in bars:
         return
     if label not in bars:
-        bars[label] = progress.add_task(label, total=None, step="")
-    bar, total = bars[label], stage["total"] or None
-    finished = stage["state"] in ("done", "failed", "cancelled")
-    if stage["state"] == "done":
-        total = total or 1
-    step = stage["state"] if stage["state"] != "running" else stage.get("step") or ""
-    completed = total if stage["state"] == "done" else stage["done"]
-    progress.update(bar, total=total, completed=completed, step=step)
-    if finished:
-        progress.stop_task(bar)
+        bars[label] = progress.add_task(label, total=1.0, step="")
+    step = stage["state"]
+    if stage["cached"]:
+        step = "from store"
+    elif step == "running":
+        step = f"{stage.get('step') or ''} {_units(stage)}"
+    progress.update(bars[label], completed=stage["fraction"], step=step)
+    if stage["state"] in ("done", "failed", "cancelled"):
+        progress.stop_task(bars[label])
+
+
+def _units(stage: dict[str, Any]) -> str:
+    """Units of the step done and in all; too many of them are bytes, which tell a reader nothing."""
+    return f"{stage['done']}/{stage['total']}" if 1 < stage["total"] < 100_000 else ""

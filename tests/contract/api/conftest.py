@@ -14,7 +14,9 @@ import httpx
 import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from typer.testing import CliRunner
 
+from l3ps_cli.main import app
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import STOP_WORKER, Stack, StackOptions, free_port
 from l3ps_platform.catalog import Catalog
@@ -151,6 +153,19 @@ def _looked_into(settings: Settings) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="session")
+def command(service):
+    """Runs a command of the CLI against the service; returns (exit code, standard output, standard error)."""
+
+    def run(*words) -> tuple[int, str, str]:
+        result = CliRunner().invoke(app, [str(word) for word in words], env={"L3PS_URL": service.url, "L3PS_TOKEN": ""})
+        if result.exception and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result.exit_code, result.stdout, result.stderr
+
+    return run
+
+
+@pytest.fixture(scope="session")
 def drive_log(tmp_path_factory) -> Path:
     """A small simulated drive: one scene of three scans."""
     from l3ps.simulate import simulate_drive
@@ -184,7 +199,7 @@ def bundle(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def api_process(tmp_path_factory) -> Iterator:
     """Starts an API of its own, without a worker; called with settings, returns its URL once it answers at all."""
     folder = tmp_path_factory.mktemp("api")

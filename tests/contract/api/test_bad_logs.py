@@ -115,6 +115,15 @@ def test_a_job_that_was_waiting_when_its_drive_was_rejected_fails_with_its_probl
     assert job["state"] == "failed" and job["errors"] and job["drive"]["state"] == "rejected"
 
 
+def test_submitting_a_bad_log_ends_with_its_problems_and_exit_code_2(service, command, log, model):
+    shutil.rmtree(log / "samples" / "LIDAR_TOP")
+    code, _, err = command("submit", log, "--model", model, "--wait")
+    assert code == 2
+    assert "LIDAR_TOP" in err and "state" not in err
+    code, _, err = command("submit", log, "--model", "no-such-model")
+    assert (code, "'no-such-model'" in err) == (2, True)
+
+
 def test_a_scan_of_three_bytes_is_named_and_can_be_skipped(service, log, model):
     drive = service.wait_for_drive(service.upload(scan_of_three_bytes(log), "torn.zip").json()["id"])
     torn = [problem for problem in drive["problems"] if "LIDAR_TOP" in problem["where"]]

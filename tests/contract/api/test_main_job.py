@@ -7,25 +7,10 @@ import tarfile
 import httpx
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from l3ps_cli.main import app
 from l3ps_cli.packing import pack_bundle, pack_log
 
 SUBMIT = ("--preset", "fast", "--format", "nuscenes", "--format", "semantickitti", "--wait", "--json")
-
-
-@pytest.fixture(scope="session")
-def command(service):
-    """Runs a command of the CLI against the service; returns (exit code, standard output, standard error)."""
-
-    def run(*words) -> tuple[int, str, str]:
-        result = CliRunner().invoke(app, [str(word) for word in words], env={"L3PS_URL": service.url, "L3PS_TOKEN": ""})
-        if result.exception and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result.exit_code, result.stdout, result.stderr
-
-    return run
 
 
 @pytest.fixture(scope="session")

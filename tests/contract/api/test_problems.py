@@ -100,7 +100,7 @@ def test_healthy_ready_and_measured(service):
     assert "/v1/jobs/none" not in metrics
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cut_off(api_process):
     """An API whose database, object store and queue all refuse connections."""
     with socket.socket() as closed:

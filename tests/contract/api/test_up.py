@@ -94,47 +94,35 @@ def assert_nothing_left(data: Path, pids: set[int], url: str) -> None:
     assert [path for path in data.rglob("*") if path.is_socket()] == []
 
 
-def test_up_serves_until_ctrl_c_and_keeps_what_it_was_given(up, tmp_path):
-    first = up()
-    url = first.wait_until_up()
-    info = json.loads((first.data / "up.json").read_text())
-    assert info == {"url": url, "token": None, "pid": first.process.pid}
+def test_a_killed_up_leaves_no_process_and_the_next_one_goes_on_with_its_data_until_ctrl_c(up):
+    killed = up()
+    url = killed.wait_until_up()
+    assert json.loads((killed.data / "up.json").read_text()) == {"url": url, "token": None, "pid": killed.process.pid}
     upload = httpx.post(f"{url}/v1/uploads", json={"kind": "drive", "filename": "a.tar", "size": 9}).json()
+    pids = killed.wait_for_a_worker_child()
+    killed.process.kill()
+    killed.process.communicate()
+    assert_nothing_left(killed.data, pids, url)
 
-    second = up()
-    code, _, complaint = second.end()
-    assert code == 1
-    assert f"already up on {first.data}, at {url}" in complaint
-    assert len(complaint.strip().splitlines()) == 1
-    assert httpx.get(f"{url}/readyz").is_success, "the first is not disturbed"
-
-    pids = first.wait_for_a_worker_child()
-    first.process.send_signal(signal.SIGINT)
-    code, out, err = first.end()
-    assert code == 0, err
-    assert "l3ps has stopped." in out
-    assert_nothing_left(first.data, pids, url)
-    assert not (first.data / "up.json").exists()
-
-    again = up("--token", "s3cret")
-    url = again.wait_until_up()
+    stack = up("--token", "s3cret")
+    url = stack.wait_until_up()
     path = f"{url}/v1/uploads/{upload['id']}"
     assert httpx.get(path).status_code == 401
     assert httpx.get(path, headers={"authorization": "Bearer s3cret"}).json()["state"] == "open"
-    again.process.send_signal(signal.SIGTERM)
-    assert again.end()[0] == 0
 
+    code, _, complaint = up().end()
+    assert code == 1
+    assert f"already up on {stack.data}, at {url}" in complaint
+    assert len(complaint.strip().splitlines()) == 1
+    assert httpx.get(f"{url}/readyz").is_success, "the running one is not disturbed"
 
-def test_a_killed_up_leaves_no_process_and_the_next_one_starts(up):
-    first = up()
-    url = first.wait_until_up()
-    pids = first.wait_for_a_worker_child()
-    first.process.kill()
-    first.process.communicate()
-    assert_nothing_left(first.data, pids, url)
-
-    second = up()
-    assert httpx.get(f"{second.wait_until_up()}/readyz").is_success
+    pids = stack.wait_for_a_worker_child()
+    stack.process.send_signal(signal.SIGINT)
+    code, out, err = stack.end()
+    assert code == 0, err
+    assert "l3ps has stopped." in out
+    assert_nothing_left(stack.data, pids, url)
+    assert not (stack.data / "up.json").exists()
 
 
 def test_when_a_part_dies_the_rest_is_stopped_and_the_part_named(up):

@@ -57,16 +57,17 @@ def test_a_bundle_without_its_network_is_exit_2(nobody, tmp_path):
 def test_a_problem_document_becomes_sentences():
     document = {
         "title": "The log cannot be used",
-        "detail": "The log has two problems.",
+        "detail": "The log has three problems, the first: calib.txt: the file is missing. Add it.",
         "errors": [
             {"where": "calib.txt", "what": "the file is missing", "remedy": "Add it."},
             {"where": "velodyne/0.bin", "what": "3 bytes are no point.", "remedy": ""},
+            {"where": "times.txt", "what": "the times go back", "remedy": "Sort them"},
         ],
     }
     assert str(ServiceProblemError(422, document)).splitlines() == [
-        "The log has two problems.",
-        "  calib.txt: the file is missing. Add it.",
+        "The log has three problems, the first: calib.txt: the file is missing. Add it.",
         "  velodyne/0.bin: 3 bytes are no point.",
+        "  times.txt: the times go back. Sort them.",
     ]
     assert sentences({}) == ["The service refused the request."]
 

@@ -52,3 +52,9 @@ def test_every_cluster_ends_with_one_class_that_one_of_its_points_had(pairs):
         won = np.unique(refined[cluster == c])
         assert len(won) == 1
         assert won[0] in semantic[cluster == c]
+
+
+def test_a_threshold_of_one_switches_the_preference_for_rare_classes_off():
+    semantic = np.array([CAR] * 3 + [BUS] * 2, np.uint8)
+    assert set(vote(np.zeros(5, np.int32), semantic, Voting(tau_rare=1.0))) == {CAR}
+    assert set(vote(np.zeros(5, np.int32), semantic, PUBLISHED)) == {BUS}

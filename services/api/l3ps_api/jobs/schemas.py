@@ -60,6 +60,7 @@ class Stage(BaseModel):
     step: str | None = Field(default=None, description="What the method is doing now.")
     done: int = Field(description="Units of the step that are finished.")
     total: int = Field(description="Units of the step in all, 0 while unknown.")
+    fraction: float = Field(description="How much of the whole stage is done, 0 to 1.")
     cached: bool = Field(default=False, description="Whether the result came from an earlier job.")
     seconds: float | None = None
     cpu_seconds: float | None = None

@@ -13,6 +13,9 @@ from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
 from l3ps_platform.workflow import cancel_job, submit_job
 
+_STEPS = ("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store")
+"""The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
+
 
 def create(services: Services, request: JobRequest) -> Job:
     """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
@@ -92,6 +95,7 @@ def _document(session: Session, job: JobRow) -> Job:
 
 
 def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
+    ordered = sorted(steps, key=lambda step: _STEPS.index(step.name) if step.name in _STEPS else len(_STEPS))
     return Stage(
         id=row.id,
         name=row.name,
@@ -100,6 +104,7 @@ def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
         step=row.progress_step,
         done=row.progress_done,
         total=row.progress_total,
+        fraction=1.0 if row.state.final else row.fraction,
         cached=row.cached,
         seconds=row.seconds,
         cpu_seconds=row.cpu_seconds,
@@ -108,7 +113,7 @@ def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
         message=(row.error or {}).get("message"),
         started_at=row.started_at,
         finished_at=row.finished_at,
-        steps=[Step(name=step.name, seconds=step.seconds, peak_mb=step.peak_mb) for step in steps],
+        steps=[Step(name=step.name, seconds=step.seconds, peak_mb=step.peak_mb) for step in ordered],
     )
 
 
