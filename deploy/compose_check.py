@@ -78,7 +78,7 @@ def check(report: Report, options: argparse.Namespace, work: Path) -> None:
         except BaseException:
             with suppress(CheckError):
                 say(stack.compose("ps", "--all"))
-                say(stack.compose("logs", "--no-color", "--tail", "25"))
+                say(stack.compose("logs", "--no-color", "--tail", "12"))
             raise
         if options.keep:
             say(f"Up at {stack.url} with L3PS_TOKEN={stack.settings['L3PS_TOKEN']} until Ctrl-C.")

@@ -91,7 +91,7 @@ def labels(stack: Stack, job: str, drive: Path) -> str:
         raise CheckError(f"Labels are served from {sorted(servers)}, not from the published object store.")
     with tempfile.TemporaryDirectory(dir=stack.work) as folder:
         stack.cli("download", job, "--format", "nuscenes", "--out", folder)
-        found = [np.load(path)["data"] for path in Path(folder).rglob("*_panoptic.npz")]
+        found = [np.load(path)["data"] for path in Path(folder, "refined").rglob("*_panoptic.npz")]
     points = sorted(path.stat().st_size // _POINT_BYTES for path in (drive / "samples" / "LIDAR_TOP").glob("*.bin"))
     if sorted(len(scan) for scan in found) != points:
         got = f"{len(found)} label files with {sum(map(len, found))} labels"
@@ -104,7 +104,7 @@ def labels(stack: Stack, job: str, drive: Path) -> str:
 
 def metrics(stack: Stack) -> str:
     """Prometheus has what the API computed from the catalog."""
-    wanted = ('up{job="l3ps"}', "sum(l3ps_scans_total)")
+    wanted = ('up{job="l3ps"}', 'l3ps_scans_total{stage="refine"}', 'l3ps_job_pq{labels="refined"}')
     deadline = time.monotonic() + SCRAPE_SECONDS
     while time.monotonic() < deadline:
         with suppress(OSError):

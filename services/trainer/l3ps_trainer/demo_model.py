@@ -25,6 +25,8 @@ from .training import Recipe, intersection_over_union, train
 
 NAME = "demo-simulated-k30"
 TRAIN_IMAGES, TRAIN_SEED = 30, 1000
+CANDIDATES = 90
+"""Pictures from which the thirty worth annotating are chosen."""
 CHECK_IMAGES, CHECK_SEED = 24, 2000
 THRESHOLD = 0.5
 """Of the boundary map; see RECIPE.md."""
@@ -35,6 +37,24 @@ def annotated(count: int, seed: int) -> list[Annotated]:
     return [Annotated(p.rgb, p.semantic, p.instance.astype(np.int32)) for p in annotated_images(count, seed)]
 
 
+def worth_annotating(candidates: list[Annotated], count: int) -> list[Annotated]:
+    """The pictures an annotator would choose: again and again the one that adds most of what is still scarce.
+
+    Args:
+        candidates: to choose from.
+        count: how many.
+    """
+    # A class counts in a picture by the square root of its pixels: present is what matters, large only helps.
+    content = np.array([np.sqrt(np.bincount(c.semantic.ravel(), minlength=len(CLASSES))[1:]) for c in candidates])
+    total, chosen = np.ones(content.shape[1]), list[int]()
+    for _ in range(count):
+        gain = (np.log(total + content) - np.log(total)).sum(axis=1)
+        gain[chosen] = -np.inf
+        chosen.append(int(gain.argmax()))
+        total += content[chosen[-1]]
+    return [candidates[i] for i in sorted(chosen)]
+
+
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
 
@@ -43,8 +63,9 @@ def _table(recipe: dict[str, Any], iou: dict[str, float | None]) -> str:
     rows = "\n".join(f"| {name} | {'–' if value is None else f'{value:.1f}'} |" for name, value in iou.items())
     return f"""# The demo's model
 
-Made by `make demo-model` (`python -m l3ps_trainer.demo_model`), which repeats it: {TRAIN_IMAGES} simulated annotated
-images (seed {TRAIN_SEED}, one street each), nothing else. The demo and the tests use other seeds. All settings are in
+Made by `make demo-model` (`python -m l3ps_trainer.demo_model`), which repeats it from {TRAIN_IMAGES} simulated
+annotated images and nothing else. They are the ones worth annotating among {CANDIDATES} pictures of as many streets
+(seed {TRAIN_SEED}): those that show what is scarce. The demo and the tests use other seeds. All settings are in
 `recipe.json`.
 
 - parameters: {recipe["parameters"]}, file {recipe["bytes"]} bytes
@@ -72,8 +93,9 @@ def main() -> None:
     settings = Recipe(steps=arguments.steps)
 
     began = time.monotonic()
-    _say(f"drawing {TRAIN_IMAGES} training and {CHECK_IMAGES} checking images")
-    known, unseen = annotated(TRAIN_IMAGES, TRAIN_SEED), annotated(CHECK_IMAGES, CHECK_SEED)
+    _say(f"drawing {CANDIDATES} pictures to choose {TRAIN_IMAGES} from, and {CHECK_IMAGES} to check on")
+    known = worth_annotating(annotated(CANDIDATES, TRAIN_SEED), TRAIN_IMAGES)
+    unseen = annotated(CHECK_IMAGES, CHECK_SEED)
     _say(f"  {time.monotonic() - began:.0f} s")
 
     def report(step: int, loss: float) -> None:
@@ -87,7 +109,7 @@ def main() -> None:
     difference = export(network, arguments.out, NAME, settings.size, THRESHOLD)
     recipe: dict[str, Any] = {
         "name": NAME,
-        "train": {"images": TRAIN_IMAGES, "seed": TRAIN_SEED},
+        "train": {"images": TRAIN_IMAGES, "chosen_from": CANDIDATES, "seed": TRAIN_SEED},
         "check": {"images": CHECK_IMAGES, "seed": CHECK_SEED},
         "training": asdict(settings),
         "boundary_threshold": THRESHOLD,

@@ -67,7 +67,7 @@ def augmented(sample: Annotated, crop: tuple[int, int], unit: float, rng: np.ran
     height, width = crop
     rows, columns = sample.semantic.shape
     least = max(height / rows, width / columns)
-    scale = max(least, unit * float(np.exp(rng.uniform(np.log(0.75), np.log(1.7)))))
+    scale = max(least, unit * float(np.exp(rng.uniform(np.log(0.85), np.log(1.5)))))
     size = (max(width, round(columns * scale)), max(height, round(rows * scale)))
     x, y = int(rng.integers(size[0] - width + 1)), int(rng.integers(size[1] - height + 1))
     window = np.s_[y : y + height, x : x + width]

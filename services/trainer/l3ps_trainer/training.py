@@ -33,13 +33,13 @@ class Recipe:
         seed: of initial weights and views.
     """
 
-    steps: int = 2000
-    batch: int = 4
-    crop: tuple[int, int] = (208, 368)
+    steps: int = 2200
+    batch: int = 3
+    crop: tuple[int, int] = (240, 432)
     size: tuple[int, int] = (288, 512)
     rate: float = 3e-3
     decay: float = 1e-4
-    hardest: float = 0.3
+    hardest: float = 0.5
     boundary_weight: float = 1.0
     seed: int = 1
 
@@ -58,10 +58,10 @@ def hard_cross_entropy(logits: Tensor, classes: Tensor, share: float, weights: T
 
 
 def class_weights(images: Sequence[Annotated], classes: int) -> Tensor:
-    """(C,) weights that lift rare classes without letting them drown the rest: (median share / share) ** 0.4."""
+    """(C,) weights that lift rare classes without letting them drown the rest: (median share / share) ** 0.3."""
     counts = sum(np.bincount(image.semantic.ravel(), minlength=classes)[:classes] for image in images)
     share = np.maximum(np.asarray(counts, np.float64) / np.sum(counts), 1e-5)
-    weights = np.clip((np.median(share[1:]) / share) ** 0.4, 0.4, 4.0)
+    weights = np.clip((np.median(share[1:]) / share) ** 0.3, 0.5, 3.0)
     return torch.from_numpy(weights.astype(np.float32))
 
 

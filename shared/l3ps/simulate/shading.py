@@ -20,8 +20,8 @@ SHADOW_REACH = 45.0
 """The shadow map covers offsets up to this from the street's axis, metres."""
 GLASS = np.array([0.06, 0.075, 0.085], dtype=np.float32)
 SHADES: dict[int, tuple[float, float, float]] = {
-    Surface.ROAD: (0.2, 0.2, 0.205),
-    Surface.SIDEWALK: (0.33, 0.32, 0.3),
+    Surface.ROAD: (0.165, 0.165, 0.17),
+    Surface.SIDEWALK: (0.36, 0.335, 0.305),
     Surface.TERRAIN: (0.17, 0.2, 0.09),
     Surface.OTHER: (0.3, 0.29, 0.27),
 }
@@ -82,8 +82,8 @@ def paint_ground(
     relative[road & patch] *= 0.8
     slab = 0.6 + 0.5 * tint
     joint = (np.abs(x / slab - np.round(x / slab)) < 0.03) | (np.abs(y / slab - np.round(y / slab)) < 0.03)
-    relative[walk & joint] *= 1 - 0.35 * _fade(away, 18)[walk & joint]
-    albedo[walk] *= 0.75 + 0.5 * ((tint * 7) % 1)
+    relative[walk & joint] *= 1 - 0.45 * _fade(away, 18)[walk & joint]
+    albedo[walk] *= 0.85 + 0.45 * ((tint * 7) % 1)
     cobble = cell_hash((x * 6).astype(np.int32), (y * 6).astype(np.int32), 3.0)
     relative[other] *= 1 + (0.5 * (cobble[other] - 0.5)) * _fade(away, 15)[other]
     dry = np.clip(0.5 + 0.45 * stain + 0.3 * blotch + (tint - 0.5), 0, 1)[grass, None]
