@@ -88,10 +88,10 @@ class Settings(BaseSettings):
     url_ttl_seconds: int = 3600
     migrate_on_start: bool | None = None  # None: when the catalog is SQLite; elsewhere a step of its own does it
 
-    # A stage belongs to its worker for this long after the last sign of life. Heartbeats come from a thread, so the
-    # longest stretch in which compiled code holds the interpreter lock must fit in: hdbscan on 456,000 points held it
-    # for 6 s at a time on two busy cores, and that grows with the points.
-    lease_seconds: float = 120.0
+    # A stage belongs to its worker for this long after the last sign of life. The signs come from a process of its own
+    # beside the pool (l3ps_worker.pulse), so the lease need not outlast what compiled code does in one go: hdbscan held
+    # the interpreter lock for more than 120 s on 1.8 M points.
+    lease_seconds: float = 60.0
     heartbeat_seconds: float = 10.0
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …

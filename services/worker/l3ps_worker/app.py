@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import atexit
-import ctypes
 import os
-import signal
 import socket
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,11 +28,11 @@ from l3ps_platform.errors import PlatformError  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
+from l3ps_worker.processes import die_with  # noqa: E402
+from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
 
 log = structlog.get_logger(__name__)
-
-_PR_SET_PDEATHSIG = 1
 
 app = make_app(settings)
 app.conf.worker_concurrency = settings.concurrency
@@ -75,7 +72,7 @@ def _configure_logging(**_: Any) -> None:
 def _after_fork(**_: Any) -> None:
     global _context  # noqa: PLW0603
     _context = None
-    _die_with(_main_pid)
+    die_with(_main_pid)
     cv2.setNumThreads(settings.threads)
 
 
@@ -104,8 +101,12 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
 
 
 @signals.worker_init.connect  # type: ignore[untyped-decorator]
-def _bury_predecessors(**_: Any) -> None:
-    """In the main process at its start: what a worker held that was killed on this machine is free at once."""
+def _begin(**_: Any) -> None:
+    """In the main process at its start, before the fork: arrange for the end, start the pulse, bury predecessors.
+
+    What a worker held that was killed on this machine is free at once.
+    """
+    atexit.register(Pulse(owner_prefix(_main_pid)).stop)
     atexit.register(_give_back_rest)  # the signal worker_shutdown is not sent when SIGQUIT ends the worker
     retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
     with _briefly() as tx:
@@ -139,12 +140,3 @@ def _briefly() -> Iterator[workflow.Transaction]:
     finally:
         catalog.dispose()
         queue.close()
-
-
-def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when the worker's main process is gone, however it went (Linux)."""
-    if sys.platform != "linux":
-        return
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-    if os.getppid() != parent:  # it went before we asked
-        os._exit(1)

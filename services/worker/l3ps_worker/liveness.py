@@ -1,17 +1,15 @@
-"""Signs of life of a running stage, and what they bring back: lease lost, job cancelled, worker stopping."""
+"""What a stage reports while it runs, and what that brings back: lease lost, job cancelled, worker stopping."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
-from types import TracebackType
 
 import structlog
 
 from l3ps.errors import L3psError
 from l3ps_platform import workflow
-from l3ps_platform.errors import CatalogUnavailable, LeaseLost
+from l3ps_platform.errors import CatalogUnavailable
 from l3ps_worker.context import Context
 
 log = structlog.get_logger(__name__)
@@ -21,67 +19,28 @@ class Stopping(L3psError):  # noqa: N818  (a request carried out, not an error)
     """The worker is to stop: give the stage back."""
 
 
-class Heartbeat:
-    """Prolongs a stage's lease from a thread while the block runs.
-
-    A catalog that is away for a while is borne: the lease may run out meanwhile, and then the row decides.
-    """
-
-    def __init__(self, context: Context, claim: workflow.Claim) -> None:
-        self._context = context
-        self._claim = claim
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name=f"heartbeat-{claim.stage_id}", daemon=True)
-        self.lost = False
-
-    def __enter__(self) -> Heartbeat:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._done.set()
-        self._thread.join()
-
-    def _beat(self) -> None:
-        while not self._done.wait(self._context.settings.heartbeat_seconds):
-            try:
-                with self._context.catalog.transaction() as tx:
-                    workflow.heartbeat(tx, self._claim)
-            except LeaseLost:
-                self.lost = True
-                return
-            except CatalogUnavailable as error:
-                log.warning("heartbeat missed", reason=str(error))
-            except Exception:
-                log.exception("heartbeat failed")
-
-
 class StageProgress:
     """Progress as the method reports it, written to the stage's row now and then.
+
+    A catalog that is away for a while is borne: the lease may run out meanwhile, and then the row decides.
 
     Args:
         context: the worker.
         claim: the stage.
-        heartbeat: the stage's heartbeat.
         steps: names of the steps the stage goes through, in order; each counts the same in the overall fraction.
 
     Calling it raises :class:`l3ps.errors.Cancelled`, :class:`Stopping` or ``LeaseLost`` when the work is to end.
     """
 
-    def __init__(self, context: Context, claim: workflow.Claim, heartbeat: Heartbeat, steps: Sequence[str]) -> None:
+    def __init__(self, context: Context, claim: workflow.Claim, steps: Sequence[str]) -> None:
         self._context = context
         self._claim = claim
-        self._heartbeat = heartbeat
         self._steps = list(steps)
         self._written = float("-inf")
         self._fraction = 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report ``done`` of ``total`` units of the step ``stage``."""
-        if self._heartbeat.lost:
-            raise LeaseLost(f"stage {self._claim.stage_id} now belongs to another worker")
         if self._context.stopping.is_set():
             raise Stopping("the worker is stopping")
         now = time.monotonic()

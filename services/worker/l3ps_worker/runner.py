@@ -16,7 +16,7 @@ from l3ps_platform.errors import LeaseLost
 from l3ps_platform.telemetry import bound
 from l3ps_worker.context import Context
 from l3ps_worker.ingest import ingest
-from l3ps_worker.liveness import Heartbeat, StageProgress, Stopping
+from l3ps_worker.liveness import StageProgress, Stopping
 from l3ps_worker.publish import publish
 from l3ps_worker.refine import STEPS as REFINE_STEPS
 from l3ps_worker.refine import refine
@@ -67,8 +67,8 @@ def _run_claimed(context: Context, claim: workflow.Claim) -> Outcome:
     book = CostBook()
     done: Done | None = None
     try:
-        with Heartbeat(context, claim) as heartbeat, book.span("stage"):
-            done = work(context, claim, StageProgress(context, claim, heartbeat, steps))
+        with book.span("stage"):
+            done = work(context, claim, StageProgress(context, claim, steps))
     except (LeaseLost, KeyboardInterrupt, SystemExit):
         raise
     except Cancelled:

@@ -2,14 +2,14 @@
 
 accept_drive, accept_model     an upload is complete → ingest
 submit_job, cancel_job         what clients ask for
-claim, heartbeat, report       a worker takes a stage and says it is alive
+claim, prolong, report       a worker takes a stage and says it is alive
 complete, drive_checked,       how it ended, and what follows from that
   model_checked, fail, cancelled
 Reconciler, lease_lost         what nobody is left to report
 """
 
 from l3ps_platform.catalog.session import Transaction
-from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, heartbeat, report
+from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, prolong, report
 from l3ps_platform.workflow.outcomes import (
     Cost,
     Retry,
@@ -42,10 +42,10 @@ __all__ = [
     "drive_checked",
     "error_json",
     "fail",
-    "heartbeat",
     "lease_lost",
     "model_checked",
     "problems_of",
+    "prolong",
     "release",
     "release_owned",
     "report",

@@ -8,6 +8,7 @@ Rows are locked in one order everywhere: drive, model, job, stage.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, cast
@@ -15,7 +16,7 @@ from typing import Any, cast
 from sqlalchemy import CursorResult, Update, select, update
 
 from l3ps.errors import Cancelled
-from l3ps_platform.catalog import bundles, drives, jobs
+from l3ps_platform.catalog import bundles, drives, jobs, stages
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
@@ -94,11 +95,25 @@ def claim(
     )
 
 
-def heartbeat(tx: Transaction, claim: Claim) -> None:
-    """Prolong the lease. LeaseLost when the stage is no longer ours."""
-    prolonged = update(StageRow).where(*owned(claim)).values(lease_until=_until(tx, claim))
-    if not changed(tx, prolonged):
-        raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+def prolong(tx: Transaction, owner_prefix: str, lives: Callable[[str], bool], lease_seconds: float) -> int:
+    """Prolong the leases that living owners hold.
+
+    Args:
+        tx: the transaction.
+        owner_prefix: only of owners whose name begins so.
+        lives: whether the owner of this name lives.
+        lease_seconds: how long the leases run from now.
+
+    Returns:
+        How many leases were prolonged.
+    """
+    count = 0
+    for stage_id, owner in stages.owned(tx.session, owner_prefix):
+        if lives(owner):
+            held = (StageRow.id == stage_id, StageRow.lease_owner == owner, StageRow.state == StageState.RUNNING)
+            until = tx.now + timedelta(seconds=lease_seconds)
+            count += changed(tx, update(StageRow).where(*held).values(lease_until=until))
+    return count
 
 
 def report(tx: Transaction, claim: Claim, step: str, done: int, total: int, *, fraction: float) -> None:

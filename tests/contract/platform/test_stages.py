@@ -100,7 +100,6 @@ def test_an_expired_lease_is_taken_over_as_the_next_attempt(play, sent) -> None:
     claim = play.take(message, owner="alive")
     assert (claim.attempt, play.stage(claim.stage_id).lease_owner) == (2, "alive")
     for write in (
-        lambda tx: workflow.heartbeat(tx, dead),
         lambda tx: workflow.report(tx, dead, "x", 1, 2, fraction=0.5),
         lambda tx: workflow.complete(tx, dead, workflow.Cost(1.0)),
         lambda tx: workflow.fail(tx, dead, ERROR, retry=RETRY),
@@ -125,11 +124,21 @@ def test_a_stage_that_kills_its_workers_is_not_taken_over_for_ever(play, sent) -
 def test_heartbeats_keep_a_stage(play, sent) -> None:
     play.submit(scenes=1)
     message = sent[0]
-    claim = play.take(message, lease=-1)
-    alive = workflow.Claim(claim.stage_id, claim.attempt, claim.owner, claim.name, 60.0, claim.job_id)
+    play.take(message, owner="host:1:2", lease=-1)
     with play.catalog.transaction() as tx:
-        workflow.heartbeat(tx, alive)
-    assert play.take(message, owner="worker-2") is None
+        assert workflow.prolong(tx, "host:1:", lambda owner: owner == "host:1:2", 60.0) == 1
+    assert play.take(message, owner="host:1:3") is None
+
+
+def test_the_dead_and_the_neighbours_get_no_heartbeat(play, sent) -> None:
+    play.submit(scenes=2)
+    first, second = list(sent)
+    play.take(first, owner="host:1:2", lease=-1)
+    play.take(second, owner="host:11:2", lease=-1)
+    with play.catalog.transaction() as tx:
+        assert workflow.prolong(tx, "host:1:", lambda owner: False, 60.0) == 0
+        assert workflow.prolong(tx, "host:1:", lambda owner: True, 60.0) == 1
+    assert play.take(second, owner="host:1:3") is not None
 
 
 def test_progress_is_seen(play, sent) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -196,7 +197,7 @@ class DirectBench(Bench):
 @pytest.fixture
 def direct(tmp_path: Path) -> Iterator[DirectBench]:
     """A bench on SQLite and a directory."""
-    settings = Settings(data_dir=tmp_path / "data", progress_seconds=0, heartbeat_seconds=0.2, threads=1)
+    settings = Settings(data_dir=tmp_path / "data", progress_seconds=0, threads=1)
     upgrade(settings.catalog_url)
     bench = DirectBench(settings)
     bench.store.ensure()
@@ -209,17 +210,9 @@ def served(tmp_path: Path, redis_url: str) -> Iterator[Callable]:
     """Benches on a real Redis with a reconciler: ``with served(database_url=…, objects_url=…) as bench``."""
 
     @contextmanager
-    def serve(**places: str) -> Iterator[Bench]:
-        settings = Settings(
-            data_dir=tmp_path / "data",
-            redis_url=redis_url,
-            progress_seconds=0.0,
-            heartbeat_seconds=0.5,
-            reconcile_seconds=0.2,
-            retry_seconds=0.1,
-            threads=1,
-            **places,
-        )
+    def serve(**places: Any) -> Iterator[Bench]:
+        quick = {"progress_seconds": 0.0, "reconcile_seconds": 0.2, "retry_seconds": 0.1}
+        settings = Settings(data_dir=tmp_path / "data", redis_url=redis_url, threads=1, **(quick | places))
         upgrade(settings.catalog_url)
         context = Context(settings)
         context.store.ensure()

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import signal
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
@@ -72,6 +73,36 @@ def test_a_job_survives_all_that_can_happen_to_its_workers(served, worker, short
         worker(bench)
         assert bench.finished(job).state is JobState.SUCCEEDED
         assert next(s for s in bench.stages(job) if s.id == stage.id).attempt == 3
+
+
+def pulse_of(worker_pid: int) -> int | None:
+    """The worker's pulse among its children, whichever of its threads started it."""
+    for task in Path(f"/proc/{worker_pid}/task").iterdir():
+        for pid in (task / "children").read_text().split():
+            if "l3ps_worker.pulse" in Path(f"/proc/{pid}/cmdline").read_text():
+                return int(pid)
+    return None
+
+
+def test_a_stage_deep_in_compiled_code_keeps_its_lease(served, worker, short_zip: Path, slow_model: Path) -> None:
+    """A stopped child can send no sign of life, like one whose clusterer holds the interpreter lock for minutes."""
+    # Seldom progress: a child stopped in the midst of writing would hold SQLite's lock.
+    with served(lease_seconds=5.0, heartbeat_seconds=0.5, progress_seconds=2.0) as bench:
+        process = worker(bench)
+        drive, _ = bench.upload_drive(short_zip), bench.upload_model(slow_model)
+        job = bench.submit(drive, preset="fast")
+        stage = bench.until(lambda: at_work(bench, job))
+        os.kill(child_of(stage), signal.SIGSTOP)
+        outlived = bench.until(lambda: at_work(bench, job)).lease_until + timedelta(seconds=1)
+        bench.until(lambda: datetime.now(UTC) > outlived)
+        assert at_work(bench, job).lease_owner == stage.lease_owner
+        os.kill(child_of(stage), signal.SIGCONT)
+        assert bench.finished(job).state is JobState.SUCCEEDED
+        assert next(s for s in bench.stages(job) if s.id == stage.id).attempt == 1
+
+        killed = pulse_of(process.pid)
+        os.kill(killed, signal.SIGKILL)
+        bench.until(lambda: pulse_of(process.pid) not in (None, killed))
 
 
 def test_a_cancelled_job_stops_in_a_real_worker(served, worker, short_zip: Path, slow_model: Path) -> None:
