@@ -17,7 +17,7 @@ from l3ps_cli.processes import ChildDiedError
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table, stage_table
 from l3ps_cli.stack import Stack, StackError, StackOptions
-from l3ps_cli.submit import create_job, ensure_model, require_success, upload_log
+from l3ps_cli.submit import check_log, create_job, ensure_model, require_success, upload_log
 from l3ps_cli.up import StopRequested, stop_on_signals
 from l3ps_cli.watch import wait_for_job
 
@@ -41,6 +41,8 @@ def demo(
     options = StackOptions(data / "service", port=0, workers=max(1, (os.cpu_count() or 1) // threads), threads=threads)
     try:
         with stop_on_signals(), service_errors():
+            if drive:
+                check_log(drive)
             log = drive or _simulated(data / "drive")
             with Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack, Client(stack.url) as client:
                 job = _run(client, stack, log, model or DEMO_MODEL, preset)

@@ -31,6 +31,11 @@ from l3ps_cli.processes import Processes, StopPlan
 READY_SECONDS = 60.0
 """The API answers after 2–3 s on two idle cores; the rest is for a machine that is busy or reads a cold disk."""
 
+WORKER = (
+    *("celery", "-A", "l3ps_worker.app", "worker", "-Q", "segment,refine"),
+    *("--without-gossip", "--without-mingle"),  # a lone worker need not wait a second for neighbours to answer
+)
+
 STOP_WORKER: StopPlan = ((SIGTERM, 4.0), (SIGQUIT, 4.0))
 """A warm shutdown waits for the stage in hand, which may take minutes; the next start takes it up again anyway."""
 
@@ -115,8 +120,8 @@ class Stack:
         self.processes.start("api", [*python, "l3ps_api"], env, cwd=self.data)
         self.processes.wait_until(self._api_ready, "the API", READY_SECONDS)
         self._say("starting the worker")
-        worker = [*python, "celery", "-A", "l3ps_worker.app", "worker", "-Q", "segment,refine", "-c"]
-        self.processes.start("worker", [*worker, str(self.options.workers)], env, cwd=self.data, stop_plan=STOP_WORKER)
+        worker = [*python, *WORKER, "-c", str(self.options.workers)]
+        self.processes.start("worker", worker, env, cwd=self.data, stop_plan=STOP_WORKER)
 
     def _start_redis(self) -> str:
         """Start Redis on a free loopback port behind a password; returns its URL."""

@@ -41,6 +41,7 @@ def submit(
     Exit codes: 0 done, 1 the job failed, 2 bad input, 3 the service cannot be reached.
     """
     with service_errors(), Client() as client:
+        check_log(log)
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
         job = create_job(
@@ -122,25 +123,26 @@ def ensure_model(client: Client, model: str) -> str:
     return name
 
 
-def upload_log(client: Client, log: Path) -> dict[str, Any]:
-    """The drive document of a log, uploaded unless the service already has one of the same bytes.
+def check_log(log: Path) -> None:
+    """Raise DriveLogError when a log is neither a directory nor an archive the service takes."""
+    if log.is_dir():
+        return
+    if not log.is_file():
+        what, remedy = "there is no such file or directory", "Name a drive log."
+        raise DriveLogError(Problem("no-log", str(log), what, remedy))
+    if not is_archive_name(log):
+        what, remedy = "it is no archive by its name", f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."
+        raise DriveLogError(Problem("no-archive", str(log), what, remedy))
 
-    Raises DriveLogError when ``log`` is neither a directory nor an archive the service takes.
-    """
+
+def upload_log(client: Client, log: Path) -> dict[str, Any]:
+    """The drive document of a log that ``check_log`` passed, uploaded unless the service has one of the same bytes."""
     if log.is_dir():
         with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
             archive = Path(scratch) / f"{log.resolve().name}.tar"
             with _bytes_bar("packing") as (_, report):
                 pack_log(log, archive, report)
             return _upload_archive(client, archive, log.resolve().name)
-    if not log.is_file():
-        what, remedy = "there is no such file or directory", "Name a drive log."
-        raise DriveLogError(Problem("no-log", str(log), what, remedy))
-    if not is_archive_name(log):
-        what = "it is no archive by its name"
-        raise DriveLogError(
-            Problem("no-archive", str(log), what, f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}.")
-        )
     name = log.name
     for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
         name = name.removesuffix(suffix)

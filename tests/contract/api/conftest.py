@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from l3ps_cli.main import app
 from l3ps_cli.processes import Processes
-from l3ps_cli.stack import STOP_WORKER, Stack, StackOptions, free_port
+from l3ps_cli.stack import STOP_WORKER, WORKER, Stack, StackOptions, free_port
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.objects import ObjectStore, open_store
@@ -131,7 +131,7 @@ def _servers(request, data) -> Iterator[Settings]:
     upgrade(settings.catalog_url)
     with Processes(data / "logs") as processes:
         processes.start("api", [sys.executable, "-m", "l3ps_api"], env)
-        worker = [sys.executable, "-m", "celery", "-A", "l3ps_worker.app", "worker", "-Q", "segment,refine", "-c", "1"]
+        worker = [sys.executable, "-m", *WORKER, "-c", "1"]
         processes.start("worker", worker, env, stop_plan=STOP_WORKER)
         processes.wait_until(lambda: _ready(settings.api_url), "the API", 60)
         yield settings

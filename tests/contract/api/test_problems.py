@@ -129,3 +129,13 @@ def test_what_cannot_be_done_now_may_be_tried_again(service, cut_off):
     answer = httpx.post(f"{cut_off}/v1/uploads", json=upload, timeout=30)
     service.refused(answer, 503, "object-store-unavailable")
     assert "SECRETSECRET" not in answer.text
+
+
+def test_a_foreign_web_page_cannot_post(service):
+    """A browser sends JSON across sites only after asking, which is refused; as plain text it is no JSON here."""
+    body = b'{"kind": "drive", "filename": "log.tar", "size": 10}'
+    headers = {"origin": "https://evil.example", "content-type": "text/plain"}
+    service.refused(service.http.post("/v1/uploads", content=body, headers=headers), 422, "invalid-request")
+    asking = {"origin": "https://evil.example", "access-control-request-method": "POST"}
+    answer = service.http.options("/v1/uploads", headers=asking)
+    assert answer.is_error and "access-control-allow-origin" not in answer.headers
