@@ -20,7 +20,7 @@ from l3ps.drivelog import opened, validate, without_bad_scans
 from l3ps.drivelog.types import Drive, Scene
 from l3ps.errors import DriveLogError, InputError, Problem
 from l3ps.evaluate import PanopticEvaluator, evaluate_scene
-from l3ps.labels import FORMATS, ScanLabels, write_poses, write_scene
+from l3ps.labels import FORMATS, LabelFormat, ScanLabels, write_poses, write_scene
 from l3ps.pipeline import primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
 from l3ps.segment.bundle import ModelBundle
@@ -92,7 +92,7 @@ def _label_scene(
     scene: Scene,
     segmenter: Segmenter,
     preset: Preset,
-    label_format: str,
+    label_format: LabelFormat,
     target: Path,
     run: Run,
     protocol: str | None,

@@ -19,7 +19,7 @@ def quality_table(quality: dict[str, Any]) -> Table:
     title = f"Quality against the log's truth, protocol {quality['protocol']}, per cent"
     table = Table(title=title, title_justify="left")
     table.add_column("class", no_wrap=True)
-    for name in ("PQ primal", "refined", "", "IoU primal", "refined", ""):
+    for name in ("PQ\nprimal", "PQ\nrefined", "", "IoU\nprimal", "IoU\nrefined", ""):
         table.add_column(name, justify="right", no_wrap=True)
     for name in _counted(primal, refined):
         before, after = primal["classes"].get(name, {}), refined["classes"].get(name, {})
