@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -29,6 +29,7 @@ from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table
 
+T = TypeVar("T")
 PARTS = ("primal", "refined", "poses.txt", "scans.txt")
 
 
@@ -63,14 +64,14 @@ def label(
     """Label every LiDAR point of a drive log; with truth in the log, score the labels too."""
     with clear_errors():
         parameters = _choose(PRESETS, preset, "--preset")
-        _choose(dict.fromkeys(FORMATS), label_format, "--format")
+        written_as = _choose(dict(zip(FORMATS, FORMATS, strict=True)), label_format, "--format")
         started = time.perf_counter()
         segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
         with opened(log) as whole, _all_or_nothing(output) as staging:
             drive = _checked(_limited(whole, scene), skip_bad_scans)
             run = Run()
             for one in drive.scenes:
-                _label_scene(drive, one, segmenter, parameters, label_format, staging, run, protocol, threads)
+                _label_scene(drive, one, segmenter, parameters, written_as, staging, run, protocol, threads)
             write_poses(staging, run.poses)
     summary = {
         "log": log.name,
@@ -173,7 +174,7 @@ def _all_or_nothing(target: Path) -> Iterator[Path]:
         shutil.rmtree(staging, ignore_errors=True)
 
 
-def _choose(known: dict[str, Any], name: str, option: str) -> Any:
+def _choose(known: dict[str, T], name: str, option: str) -> T:
     if name not in known:
         fail(f"{option}: there is no '{name}'. Use one of {', '.join(known)}.", BAD_INPUT)
     return known[name]
