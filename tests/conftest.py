@@ -55,13 +55,13 @@ def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture
 def redis_url(redis_server: str) -> Iterator[str]:
-    """URL of an empty Redis."""
+    """URL of an empty Redis database. Services that outlive a test use another one of the server's sixteen."""
     import redis
 
     with redis.Redis.from_url(redis_server) as client:
-        client.flushall()
+        client.flushdb()
         yield redis_server
-        client.flushall()
+        client.flushdb()
 
 
 @pytest.fixture(scope="session")

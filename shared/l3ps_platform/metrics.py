@@ -123,7 +123,7 @@ def _depth(depth: dict[QueueName, int]) -> Metric:
 
 
 def _quality(jobs: list[JobRow]) -> list[Metric]:
-    labels = ["job", "labels", "protocol"]
+    labels = ["job_id", "labels", "protocol"]
     families = {
         "pq": GaugeMetricFamily("l3ps_job_pq", "Panoptic quality of a job's labels, per cent.", labels=labels),
         "miou": GaugeMetricFamily("l3ps_job_miou", "Mean IoU of a job's labels, per cent.", labels=labels),

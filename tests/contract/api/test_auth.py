@@ -8,7 +8,7 @@ TOKEN = "a-long-enough-token"
 
 @pytest.fixture(scope="module")
 def guarded(api_process, redis_server) -> str:
-    return api_process(token=TOKEN, redis_url=redis_server)
+    return api_process(token=TOKEN, redis_url=redis_server.removesuffix("/0") + "/2")
 
 
 @pytest.mark.parametrize("path", ["/v1/drives", "/v1/jobs", "/v1/models", "/v1/jobs/x/labels", "/v1/uploads/x"])

@@ -43,7 +43,7 @@ def test_figures_of_a_finished_job(catalog: Catalog, play, sent, tidy) -> None:
     assert found["l3ps_jobs", (("state", "succeeded"),)] == 1
     assert found["l3ps_jobs", (("state", "failed"),)] == 0
     assert found["l3ps_stages", (("stage", "segment"), ("state", "done"))] == 2
-    labels = (("job", job), ("labels", "refined"), ("protocol", "nuscenes"))
+    labels = (("job_id", job), ("labels", "refined"), ("protocol", "nuscenes"))
     assert found["l3ps_job_pq", labels] == 42.5
     assert ("l3ps_job_miou", labels) not in found
 
@@ -70,7 +70,7 @@ def test_quality_is_kept_for_the_most_recent_jobs_only(catalog: Catalog, play, s
         while sent:
             quality = {"protocol": "nuscenes", "primal": {"pq": 1.0}, "refined": {"pq": 2.0}}
             play.run(lambda tx, claim, q=quality: workflow.complete(tx, claim, workflow.Cost(1.0), quality=q))
-    found = {dict(labels)["job"] for name, labels in scrape(catalog, tidy.queue, jobs=2) if name == "l3ps_job_pq"}
+    found = {dict(labels)["job_id"] for name, labels in scrape(catalog, tidy.queue, jobs=2) if name == "l3ps_job_pq"}
     assert found == set(ids[1:])
 
 

@@ -1,6 +1,7 @@
 """Model bundles: what is accepted, and what a user is told about the rest."""
 
 import json
+import os
 import zipfile
 
 import pytest
@@ -99,3 +100,7 @@ def test_deeply_nested_json_is_refused(write_bundle):
     (folder / "model.json").write_text(json.dumps([1, 2]))
     with pytest.raises(ModelError):
         ModelBundle.load(folder)
+
+
+def test_the_runtime_is_told_not_to_report_its_use():
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
