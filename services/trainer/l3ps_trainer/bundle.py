@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import torch
 
@@ -64,6 +65,7 @@ def export(network: PanopticNet, folder: Path, name: str, size: tuple[int, int],
             network, (image,), str(path), input_names=["image"], output_names=["semantic", "boundary"], dynamo=True,
             external_data=False, verbose=False,
         )  # fmt: skip
+    _strip(path)
     text = json.dumps(describe(name, size, boundary_threshold), indent=2)
     (folder / "model.json").write_text(text + "\n")
 
@@ -75,3 +77,13 @@ def export(network: PanopticNet, folder: Path, name: str, size: tuple[int, int],
     if difference > TOLERANCE:
         raise RuntimeError(f"{path} differs from the trained network by {difference:.2g}; more than {TOLERANCE:.0e}")
     return difference
+
+
+def _strip(path: Path) -> None:
+    """Drop what the exporter notes down for its own authors: stack traces with the paths of this machine."""
+    model = onnx.load(path)
+    graph = model.graph
+    for noted in (model, graph, *graph.node, *graph.value_info, *graph.initializer, *graph.input, *graph.output):
+        del noted.metadata_props[:]
+        noted.doc_string = ""
+    onnx.save(model, path)

@@ -1,7 +1,9 @@
 """The commands there are, and that those which only talk to a service start without the method's packages."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 from typer.testing import CliRunner
 
@@ -29,3 +31,11 @@ def test_service_commands_do_not_import_the_method():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_the_packaged_model_tells_nothing_of_the_machine_it_was_made_on():
+    import l3ps_cli
+
+    graph = (Path(l3ps_cli.__file__).parent / "models" / "demo" / "model.onnx").read_bytes()
+    assert len(graph) < 3_000_000
+    assert not re.search(rb"site-packages|\.py\b|/home/|/root/", graph)

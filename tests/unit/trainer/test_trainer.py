@@ -51,6 +51,7 @@ def test_the_bundle_gives_what_torch_gives_and_the_product_loads_it(network, tmp
     assert image.semantic.shape == SIZE
     assert (image.semantic[:, :28] == 4).mean() > 0.8
     assert (image.semantic[:, 36:] == 11).mean() > 0.8
+    assert b".py" not in (tmp_path / "model.onnx").read_bytes(), "no trace of the machine it was exported on"
 
 
 def test_boundary_target_is_zero_beside_another_instance():
