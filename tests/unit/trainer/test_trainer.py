@@ -7,6 +7,7 @@ import torch
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
 from l3ps_trainer.bundle import CLASSES, TOLERANCE, export
+from l3ps_trainer.demo_model import worth_annotating
 from l3ps_trainer.network import PanopticNet
 from l3ps_trainer.samples import Annotated, augmented, inside
 from l3ps_trainer.training import Recipe, hard_cross_entropy, intersection_over_union, train
@@ -78,3 +79,12 @@ def test_views_keep_image_and_truth_together():
         if view.semantic.min() == 4 and view.semantic.max() == 11:
             assert (bright == (view.semantic == 4)).mean() > 0.9
         assert ((view.instance > 0) == (view.semantic == 4)).all()
+
+
+def test_the_pictures_chosen_for_annotation_show_what_is_scarce():
+    def plain(label):
+        return Annotated(np.zeros((8, 8, 3), np.uint8), np.full((8, 8), label, np.uint8), np.zeros((8, 8), np.int32))
+
+    pictures = [plain(11) for _ in range(9)] + [plain(6)]
+    chosen = worth_annotating(pictures, 2)
+    assert sorted(int(picture.semantic[0, 0]) for picture in chosen) == [6, 11]
