@@ -123,8 +123,9 @@ def _bad_input(_: Request, error: InputError) -> ApiProblem:
     return ApiProblem(422, "bad-input", "The input cannot be used", str(error), items(error.problems))
 
 
-def _not_found(_: Request, error: NotFound) -> ApiProblem:
-    return unknown(error.kind, error.id)
+def _not_found(request: Request, error: NotFound) -> ApiProblem:
+    in_path = error.id in request.path_params.values()
+    return unknown(error.kind, error.id, "path" if in_path else {"drive": "drive_id"}.get(error.kind, error.kind))
 
 
 def _conflict(_: Request, error: Conflict) -> ApiProblem:

@@ -75,14 +75,14 @@ def stored_items(problems: Iterable[Mapping[str, Any]] | None) -> list[ErrorItem
     return [ErrorItem.model_validate(problem) for problem in problems or ()]
 
 
-def unknown(kind: str, identifier: str) -> ApiProblem:
-    """404 for an id that names nothing."""
+def unknown(kind: str, identifier: str, where: str = "path") -> ApiProblem:
+    """404 for an id that names nothing; ``where`` it was given."""
     return ApiProblem(
         404,
         f"unknown-{kind}",
         f"Unknown {kind}",
         f"There is no {kind} {identifier!r}. GET /v1/{kind}s lists those there are.",
-        [ErrorItem(where="path", what=f"no {kind} has the id {identifier!r}", remedy=f"Use an id from /v1/{kind}s.")],
+        [ErrorItem(where=where, what=f"no {kind} has the id {identifier!r}", remedy=f"Use an id from /v1/{kind}s.")],
     )
 
 

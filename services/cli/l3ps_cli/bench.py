@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from l3ps.drivelog import opened
-from l3ps.drivelog.types import Points, Scene
+from l3ps.drivelog.types import Drive, Points, Scan, Scene
 from l3ps.labels import ScanLabels
 from l3ps.pipeline import refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS
@@ -24,7 +24,7 @@ from l3ps.refine.accumulate import transform
 from l3ps.refine.cluster import hdbscan_package
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.taxonomy import NUSCENES16
-from l3ps_cli.errors import clear_errors, out
+from l3ps_cli.errors import BAD_INPUT, clear_errors, fail, out
 from l3ps_cli.progress import bars
 
 app = typer.Typer(help="Measure on your own logs.", no_args_is_help=True)
@@ -46,21 +46,31 @@ def refine(
 ) -> None:
     """Seconds and peak memory of each refinement stage on the first scene of a log.
 
-    No model is needed: the stages cost the same whatever the primal labels say, so points are labelled by their
-    height.
+    No model is needed: the log's truth stands for the primal labels, or where it has none, labels by height.
     """
-    with clear_errors(), opened(log) as drive:
+    with clear_errors():
+        if preset not in PRESETS:
+            fail(f"--preset: there is no '{preset}'. Use one of {', '.join(PRESETS)}.", BAD_INPUT)
+        figures = _figures(log, scans, scene, preset, threads)
+    if as_json:
+        typer.echo(json.dumps(figures))
+    else:
+        _show(figures)
+
+
+def _figures(log: Path, scans: int | None, scene: str | None, preset: str, threads: int) -> dict[str, Any]:
+    with opened(log) as drive:
         chosen = next((s for s in drive.scenes if scene in (None, s.name)), None)
         if chosen is None:
             raise typer.BadParameter(f"the log has no scene '{scene}'", param_hint="--scene")
         part = Scene(chosen.name, chosen.scans[:scans])
         clouds = [scan.load_points() for scan in part.scans]
-        primal = [_by_height(scan.token, cloud) for scan, cloud in zip(part.scans, clouds, strict=True)]
+        primal = [_stand_in(drive, scan, cloud) for scan, cloud in zip(part.scans, clouds, strict=True)]
         with bars() as progress:
             refined = refine_scene(
                 part, primal, PRESETS[preset], sensor_height=drive.sensor_height, threads=threads, progress=progress
             )
-        figures: dict[str, Any] = {
+        return {
             "log": log.name,
             "scene": part.name,
             "scans": len(part.scans),
@@ -72,10 +82,6 @@ def refine(
             "peak_mb": max(cost.peak_mb for cost in refined.costs.values()),
             "clustering": _peers(clouds, refined.poses, drive.sensor_height, PRESETS[preset].min_cluster_size, threads),
         }
-    if as_json:
-        typer.echo(json.dumps(figures))
-    else:
-        _show(figures)
 
 
 def _peers(
@@ -107,13 +113,16 @@ def _peers(
     return seconds
 
 
-def _by_height(token: str, cloud: Points) -> ScanLabels:
-    """Stand-in labels: from low to high above the sensor's horizon minus its height, road, car, building."""
+def _stand_in(drive: Drive, scan: Scan, cloud: Points) -> ScanLabels:
+    """Labels that cost about what real ones do: the truth, or road, cars and buildings by height."""
+    if scan.load_truth is not None and drive.truth_space == NUSCENES16.name:
+        truth = scan.load_truth()
+        return ScanLabels(scan.token, truth.semantic, truth.instance)
     z = cloud.xyz[:, 2]
     semantic = np.full(len(z), NUSCENES16.index("manmade"), dtype=np.uint8)
-    semantic[z < 0.5] = NUSCENES16.index("car")
+    semantic[z < 0] = NUSCENES16.index("car")
     semantic[z < -1.4] = NUSCENES16.index("driveable_surface")
-    return ScanLabels(token, semantic, (semantic == NUSCENES16.index("car")).astype(np.int32))
+    return ScanLabels(scan.token, semantic, (semantic == NUSCENES16.index("car")).astype(np.int32))
 
 
 def _show(figures: dict[str, Any]) -> None:

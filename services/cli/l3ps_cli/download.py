@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
@@ -42,7 +43,7 @@ def fetch_labels(client: Client, job: str, folder: Path, label_format: str | Non
 
     Raises DamagedDownloadError when a file's bytes are not those the service announced.
     """
-    listing = client.get(f"/jobs/{job}/labels", format=label_format)
+    listing = client.get(f"/jobs/{quote(job, safe='')}/labels", format=label_format)
     files: list[dict[str, Any]] = listing["files"]
     with Progress(TextColumn("labels"), BarColumn(), DownloadColumn(), console=err) as progress:
         bar = progress.add_task("labels", total=sum(file["size"] for file in files))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import typer
 from rich.table import Table
@@ -26,9 +27,11 @@ def jobs(
         raise typer.BadParameter("--cancel needs the id of a job")
     with service_errors(), Client() as client:
         if job and cancel:
-            document = client.post(f"/jobs/{job}/cancel")
+            document = client.post(f"/jobs/{quote(job, safe='')}/cancel")
         else:
-            document = client.get(f"/jobs/{job}") if job else client.get("/jobs", limit=limit, state=state)
+            document = (
+                client.get(f"/jobs/{quote(job, safe='')}") if job else client.get("/jobs", limit=limit, state=state)
+            )
     if as_json:
         out.print_json(data=document)
     elif job:

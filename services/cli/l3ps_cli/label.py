@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -15,21 +16,22 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from l3ps.costs import StageCost
+from l3ps.costs import CostBook
 from l3ps.drivelog import opened, validate, without_bad_scans
 from l3ps.drivelog.types import Drive, Scene
 from l3ps.errors import DriveLogError, InputError, Problem
-from l3ps.evaluate import PanopticEvaluator, evaluate_scene
+from l3ps.evaluate import PROTOCOLS, PanopticEvaluator, evaluate_scene
 from l3ps.labels import FORMATS, LabelFormat, ScanLabels, write_poses, write_scene
 from l3ps.pipeline import primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
-from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
+from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out, stopped_by_sigterm
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table
 
 T = TypeVar("T")
+LABEL_SUFFIXES = ("_panoptic.npz", "_lidarseg.bin", ".label")
 PARTS = ("primal", "refined", "poses.txt", "scans.txt")
 
 
@@ -62,9 +64,14 @@ def label(
     threads: Annotated[int, typer.Option(min=1, help="Threads of each step.")] = 2,
 ) -> None:
     """Label every LiDAR point of a drive log; with truth in the log, score the labels too."""
-    with clear_errors():
+    with clear_errors(), stopped_by_sigterm():
         parameters = _choose(PRESETS, preset, "--preset")
         written_as = _choose(dict(zip(FORMATS, FORMATS, strict=True)), label_format, "--format")
+        if protocol is not None:
+            _choose(PROTOCOLS, protocol, "--protocol")
+        if report is not None:
+            report.parent.mkdir(parents=True, exist_ok=True)
+            report.touch()  # better to fail now than after the work
         started = time.perf_counter()
         segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
         with opened(log) as whole, _all_or_nothing(output) as staging:
@@ -83,7 +90,6 @@ def label(
         "quality": {side: evaluator.quality().as_dict() for side, evaluator in run.quality.items()},
     }
     if report is not None:
-        report.parent.mkdir(parents=True, exist_ok=True)
         report.write_text(json.dumps(summary, indent=2) + "\n")
     _show(summary, output)
 
@@ -100,9 +106,9 @@ def _label_scene(
     threads: int,
 ) -> None:
     with bars(f"{scene.name}  ") as progress:
-        began = time.perf_counter()
-        primal = primal_labels(scene, segmenter, progress)
-        segment_seconds = time.perf_counter() - began
+        book = CostBook()
+        with book.span("segment"):
+            primal = primal_labels(scene, segmenter, progress)
         refined = refine_scene(
             scene, primal, preset, sensor_height=drive.sensor_height, threads=threads, progress=progress
         )
@@ -111,7 +117,7 @@ def _label_scene(
         write_scene(target / side, label_format, scene, labels)
         if any(scan.load_truth is not None for scan in scene.scans):
             run.score(side, evaluate_scene(drive, scene, labels, protocol or drive.truth_space))
-    costs = {"segment": StageCost(seconds=segment_seconds)} | refined.costs
+    costs = book.stages | refined.costs
     run.poses.append((scene, refined.poses))
     run.scenes.append(
         {
@@ -150,14 +156,18 @@ def _checked(drive: Drive, skip_bad_scans: bool) -> Drive:
 
 @contextmanager
 def _all_or_nothing(target: Path) -> Iterator[Path]:
-    """A folder to write to that replaces the parts of ``target`` only when the block ends well."""
-    staging = target / ".partial"
+    """A folder to write to that replaces the labels in ``target`` only when the block ends well.
+
+    Raises:
+        InputError: ``target`` cannot be written to, or holds files in the labels' places that are no labels.
+    """
+    _refuse_foreign_files(target)
     is_new = not target.exists()
     try:
-        shutil.rmtree(staging, ignore_errors=True)
-        staging.mkdir(parents=True)
+        target.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=".partial-", dir=target))
     except OSError as error:
-        what = f"the folder cannot be made ({error.strerror})"
+        what = f"the folder cannot be made or written to ({error.strerror})"
         raise InputError(Problem("bad-output", str(target), what, "Name a folder that you may write to.")) from error
     try:
         yield staging
@@ -166,12 +176,19 @@ def _all_or_nothing(target: Path) -> Iterator[Path]:
             if old.is_dir():
                 shutil.rmtree(old)
             (staging / part).replace(old)
-    except BaseException:
-        if is_new:
-            shutil.rmtree(target, ignore_errors=True)
-        raise
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+        if is_new:
+            with suppress(OSError):
+                target.rmdir()  # only where nothing was written
+
+
+def _refuse_foreign_files(target: Path) -> None:
+    for part in ("primal", "refined"):
+        for path in sorted((target / part).rglob("*")):
+            if path.is_file() and not path.name.endswith(LABEL_SUFFIXES):
+                what = f"{part}/ would be replaced but holds {path.relative_to(target)}, which is no label file"
+                raise InputError(Problem("bad-output", str(target), what, "Move it away, or name another folder."))
 
 
 def _choose(known: dict[str, T], name: str, option: str) -> T:

@@ -27,9 +27,21 @@ def quality_table(quality: dict[str, Any]) -> Table:
     table.add_section()
     things = _pair(primal.get("pq_things"), refined.get("pq_things"))
     table.add_row("mean, things", *things, "", "", "")
+    table.caption, table.caption_justify = _remarks(primal, refined), "left"
     mean = _pair(primal["pq"], refined["pq"]) + _pair(primal["miou"], refined["miou"])
     table.add_row("mean", *mean, style="bold")
     return table
+
+
+def _remarks(primal: dict[str, Any], refined: dict[str, Any]) -> str:
+    """What a reader must know to judge the figures."""
+    void = [side.get("unlabelled") for side in (primal, refined)]
+    remarks = []
+    if None not in void:
+        remarks.append(f"Points with truth that got no label: {void[0]:.1f} % primal, {void[1]:.1f} % refined.")
+    if refined["pq"] is None and _counted(primal, refined):
+        remarks.append("No mean PQ: the truth has things without instances.")
+    return "\n".join(remarks)
 
 
 def stage_table(job: dict[str, Any]) -> Table:

@@ -12,9 +12,11 @@ from urllib.parse import quote
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-from l3ps.errors import DriveLogError, Problem
+from l3ps.errors import DriveLogError, InputError, Problem
+from l3ps.presets import PRESETS
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
+from l3ps_cli.errors import INTERRUPTED
 from l3ps_cli.packing import ARCHIVE_SUFFIXES, Report, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
 from l3ps_cli.watch import wait_for_job
 
@@ -42,6 +44,7 @@ def submit(
     """
     with service_errors(), Client() as client:
         check_log(log)
+        _check_settings(preset, formats, protocol)
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
         job = create_job(
@@ -54,13 +57,32 @@ def submit(
             skip_bad_scans=skip_bad_scans,
         )
         if wait:
-            job = wait_for_job(client, job["id"], err)
+            try:
+                job = wait_for_job(client, job["id"], err)
+            except KeyboardInterrupt:
+                fail(f"Job {job['id']} goes on; `l3ps jobs {job['id']} --cancel` stops it.", INTERRUPTED)
     if as_json:
         out.print_json(data=job)
     else:
         out.print(f"job {job['id']}: {job['state']}", highlight=False)
     if wait:
         require_success(job)
+
+
+def _check_settings(preset: str, formats: list[str] | None, protocol: str | None) -> None:
+    """InputError for what the service would refuse only once a large log has been sent."""
+    from l3ps.evaluate import PROTOCOLS
+    from l3ps.labels import FORMATS
+
+    asked: list[tuple[str, str, list[str]]] = [
+        ("--preset", preset, list(PRESETS)),
+        ("--protocol", protocol or "nuscenes", list(PROTOCOLS)),
+        *(("--format", one, list(FORMATS)) for one in formats or ()),
+    ]
+    for option, value, known in asked:
+        if value not in known:
+            what, remedy = f"there is no '{value}'", f"Use one of {', '.join(known)}."
+            raise InputError(Problem("unknown-setting", option, what, remedy))
 
 
 def create_job(

@@ -14,6 +14,7 @@ from typing import Annotated
 import typer
 
 from l3ps_cli.console import JOB_FAILED, err, fail, out
+from l3ps_cli.errors import clear_errors
 from l3ps_cli.processes import ChildDiedError
 from l3ps_cli.stack import Stack, StackError, StackOptions
 
@@ -50,7 +51,9 @@ def up(
     data: Annotated[
         Path, typer.Option(help="Directory that holds everything.", envvar="L3PS_DATA_DIR", file_okay=False)
     ] = DEFAULT_DATA,
-    port: Annotated[int, typer.Option(help="Port of the API on 127.0.0.1; 0 takes any free one.")] = 8080,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the API on 127.0.0.1; 0 takes any free one.")
+    ] = 8080,
     workers: Annotated[int, typer.Option(min=0, help="Worker processes; 0 for one per two cores.")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="Threads each worker process may use.")] = 2,
     token: Annotated[
@@ -62,7 +65,7 @@ def up(
     count = workers or max(1, (os.cpu_count() or 1) // threads)
     options = StackOptions(data.expanduser(), port, count, threads, token or None)
     try:
-        with stop_on_signals(), Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack:
+        with stop_on_signals(), clear_errors(), Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack:
             out.print(f"l3ps is up at {stack.url}  (data: {stack.data}, logs: {stack.logs})", highlight=False)
             out.print("Ctrl-C stops it.")
             follow = _Follower(stack.logs) if logs else None

@@ -126,3 +126,34 @@ def test_simulate_makes_a_drive_and_touches_no_folder_in_use(tmp_path):
     again = run("simulate", "--out", tmp_path / "new")
     assert again.exit_code == 2
     assert "not an empty folder" in again.stderr
+
+
+def test_files_of_the_user_in_the_way_are_not_deleted(small_drive, bundle, tmp_path):
+    notes = tmp_path / "o" / "refined" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("precious")
+    result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o")
+    assert result.exit_code == 2
+    assert "notes.txt" in result.stderr
+    assert files_under(tmp_path / "o") == {"refined/notes.txt": b"precious"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("label", "--protocol", "foo"), "there is no 'foo'"),
+        (("label", "--report", "/dev/null/report.json"), "/dev/null"),
+        (("label", "--out", "/dev/null/labels"), "/dev/null"),
+        (("bench", "refine", "--preset", "foo"), "there is no 'foo'"),
+    ],
+)
+def test_what_cannot_work_is_said_before_the_work(small_drive, bundle, tmp_path, arguments, expected):
+    command, *options = arguments
+    if command == "label":
+        options = [small_drive, "--model", bundle, "--out", tmp_path / "o", *options]
+    else:
+        options = [*options, "--log", small_drive]
+    result = run(command, *options)
+    assert result.exit_code == 2, result.output
+    assert expected in result.stderr
+    assert not isinstance(result.exception, OSError | KeyError | ValueError)
