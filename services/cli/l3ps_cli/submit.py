@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,10 +74,10 @@ def _check_settings(preset: str, formats: list[str] | None, protocol: str | None
     from l3ps.evaluate import PROTOCOLS
     from l3ps.labels import FORMATS
 
-    asked: list[tuple[str, str, list[str]]] = [
+    asked: list[tuple[str, str, Sequence[str]]] = [
         ("--preset", preset, list(PRESETS)),
         ("--protocol", protocol or "nuscenes", list(PROTOCOLS)),
-        *(("--format", one, list(FORMATS)) for one in formats or ()),
+        *(("--format", one, FORMATS) for one in formats or ()),
     ]
     for option, value, known in asked:
         if value not in known:
