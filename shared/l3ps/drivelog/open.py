@@ -40,8 +40,8 @@ def open_drive(path: Path, *, sweeps: bool = False, skip_bad_scans: bool = False
 
 def _find(path: Path, sweeps: bool) -> Drive:
     if not path.is_dir():
-        what = "it is a file, not a folder" if path.exists() else "there is no such folder"
-        raise DriveLogError(Problem("no-log", str(path), what, "Name the folder of a drive log, or unpack the archive"))
+        what = "it is a file, not a folder" if path.exists() else "there is no such file or folder"
+        raise DriveLogError(Problem("no-log", str(path), what, "Name a drive log: its folder or an archive of it"))
     folder = path.resolve()
     for _ in range(_NESTING + 1):
         drive = _open_here(folder, sweeps)

@@ -60,7 +60,7 @@ def test_no_log_says_what_was_looked_for(tmp_path):
 
 
 def test_no_such_folder(tmp_path):
-    with pytest.raises(DriveLogError, match="there is no such folder"):
+    with pytest.raises(DriveLogError, match="there is no such file or folder"):
         open_drive(tmp_path / "nowhere")
     (tmp_path / "file").touch()
     with pytest.raises(DriveLogError, match="it is a file"):
