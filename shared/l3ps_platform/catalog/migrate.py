@@ -5,13 +5,16 @@ Run as ``python -m l3ps_platform.catalog.migrate`` with the service's settings.
 
 from __future__ import annotations
 
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, Engine, text
 
 from l3ps_platform.catalog.session import make_engine
 from l3ps_platform.settings import get_settings
@@ -23,13 +26,25 @@ def upgrade(url: str) -> None:
     """Create or migrate the catalog at ``url``; does nothing when it is current. Safe to run concurrently."""
     engine = make_engine(url)
     try:
-        with engine.begin() as connection:
+        with _alone(engine), engine.begin() as connection:
             if connection.dialect.name == "postgresql":
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
             if not is_current(connection):
                 command.upgrade(_config(connection), "head")
     finally:
         engine.dispose()
+
+
+@contextmanager
+def _alone(engine: Engine) -> Iterator[None]:
+    """One process or thread at a time on a SQLite file: switching it to WAL does not wait for others."""
+    path = engine.url.database
+    if engine.dialect.name != "sqlite" or not path:
+        yield
+        return
+    with open(f"{path}.migrating", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def is_current(connection: Connection) -> bool:

@@ -109,7 +109,7 @@ def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -
             drives.lock(tx.session, drive).object_key = key
     with play.catalog.transaction() as tx:
         drives.delete(tx, deleted)
-    assert tidy().archives == 2
+    assert tidy.rounds().archives == 2
     assert [info.key for info in tidy.store.list()] == ["a/3"]
     assert tidy().archives == 0
 
