@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import psycopg
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
@@ -118,9 +119,11 @@ def _embedded(request, data) -> Iterator[Settings]:
 @contextmanager
 def _servers(request, data) -> Iterator[Settings]:
     postgres, minio, redis = map(request.getfixturevalue, ("postgres_server", "minio_server", "redis_server"))
+    with psycopg.connect(postgres.get_uri(), autocommit=True) as connection:
+        connection.execute("CREATE DATABASE service")  # its reconciler would tidy up in other tests' catalogs
     settings = Settings(
         data_dir=data,
-        database_url=postgres.get_uri(),
+        database_url=postgres.get_uri(database="service"),
         objects_url=f"s3://{minio}/l3ps-{secrets.token_hex(4)}?secure=0",
         redis_url=redis.removesuffix("/0") + "/1",  # its worker takes every message, other tests' too
         port=free_port(),

@@ -215,11 +215,6 @@ def tidy(catalog: Catalog, redis_url: str, tmp_path: Path) -> Iterator[Callable[
     def run(**settings: Any) -> workflow.Report:
         return workflow.Reconciler(catalog, queue, store, Settings(redis_url=redis_url, **settings)).run_once()
 
-    def rounds(**settings: Any) -> workflow.Report:
-        """Three rounds, summed: what a clock that was set back hid from one is found by the next."""
-        reports = [run(**settings) for _ in range(3)]
-        return workflow.Report(**{f: sum(getattr(r, f) for r in reports) for f in workflow.Report.__slots__})
-
-    run.queue, run.store, run.settings, run.rounds = queue, store, Settings(redis_url=redis_url), rounds
+    run.queue, run.store, run.settings = queue, store, Settings(redis_url=redis_url)
     yield run
     queue.close()

@@ -31,7 +31,7 @@ def test_nothing_to_do(tidy, play) -> None:
 def test_a_dead_worker_s_stage_is_tried_again_and_the_job_succeeds(tidy, play, sent) -> None:
     job = play.submit(scenes=1)
     play.take(lease=-1)
-    assert tidy.rounds(retry_seconds=0) == workflow.Report(expired=1, retried=1)
+    assert tidy(retry_seconds=0) == workflow.Report(expired=1, retried=1)
     assert [(m.name, m.attempt) for m in sent] == [("segment", 2)]
     assert play.finish_all() == ["segment", "refine", "publish"]
     assert play.job(job).state is JobState.SUCCEEDED
@@ -41,7 +41,7 @@ def test_a_stage_that_kills_every_worker_fails_with_a_reason(tidy, play, sent) -
     job = play.submit(scenes=1)
     for _ in range(3):
         play.take(lease=-1)
-        tidy.rounds(retry_seconds=0)
+        tidy(retry_seconds=0)
     assert not sent
     row = play.job(job)
     assert row.state is JobState.FAILED
@@ -92,7 +92,7 @@ def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     tidy.store.put_bytes("uploads/u/d.zip", b"archive")
     for _ in range(3):
         play.take(lease=-1)
-        tidy.rounds(retry_seconds=0)
+        tidy(retry_seconds=0)
     with play.catalog.reading() as session:
         row = drives.get(session, drive.id)
     assert row.state is DriveState.REJECTED
@@ -109,7 +109,7 @@ def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -
             drives.lock(tx.session, drive).object_key = key
     with play.catalog.transaction() as tx:
         drives.delete(tx, deleted)
-    assert tidy.rounds().archives == 2
+    assert tidy().archives == 2
     assert [info.key for info in tidy.store.list()] == ["a/3"]
     assert tidy().archives == 0
 
@@ -146,7 +146,7 @@ def test_two_reconcilers_at_once_send_one_message(tidy, play, sent) -> None:
 
     def sweep() -> None:
         barrier.wait()
-        tidy.rounds(retry_seconds=0)
+        tidy(retry_seconds=0)
 
     threads = [threading.Thread(target=sweep) for _ in range(3)]
     for thread in threads:
