@@ -71,7 +71,7 @@ def variants(sizes: bool = True) -> Iterator[Row]:
     yield Row("paper", PAPER)
     yield Row("best", BEST)
     for name, preset in _set_back(BEST, PAPER):
-        yield Row(f"best, {name} as in paper", preset)
+        yield Row(f"best, paper's {name}", preset)
     if sizes:
         for size in CLUSTER_SIZES:
             yield Row(f"paper, min_cluster_size {size}", replace(PAPER, min_cluster_size=size))
@@ -153,9 +153,10 @@ def _figures(before: Quality, after: Quality) -> dict[str, Any]:
 
 
 def _table(result: dict[str, Any], protocol: str) -> Table:
-    table = Table("variant", title=f"{result['log']}, protocol {protocol}, per cent", title_justify="left")
-    for column in ("PQ", "PQ things", "mIoU", "worst class, IoU against primal", "seconds"):
-        table.add_column(column, justify="right")
+    table = Table(title=f"{result['log']}, protocol {protocol}, per cent", title_justify="left")
+    table.add_column("variant", no_wrap=True)
+    for column in ("PQ", "PQ\nthings", "mIoU", "worst class,\nIoU to primal", "s"):
+        table.add_column(column, justify="right", no_wrap=True)
     for row in result["rows"]:
         worst = "" if row["worst_class"] is None else f"{row['worst_class']} {row['worst_iou_change']:+.1f}"
         figures = [row["pq"], row["pq_things"], row["miou"]]
