@@ -118,4 +118,5 @@ def _around_one_centre(points: NDArray[Any], *others: NDArray[Any]) -> tuple[NDA
     if all(rows.dtype == np.float32 for rows in (points, *others)):
         return points, *others
     centre = points.mean(axis=0, dtype=np.float64) if len(points) else np.zeros(points.shape[1])
-    return tuple((rows - centre).astype(np.float32) for rows in (points, *others))
+    with np.errstate(invalid="ignore"):  # what is not finite is refused where it is read
+        return tuple((rows - centre).astype(np.float32) for rows in (points, *others))
