@@ -122,4 +122,5 @@ NB_MODULE(_core, module) {
     module.def("nearest", &nearest_points, "points"_a, "queries"_a, "k"_a, "max_distance"_a, "threads"_a, "cancel"_a.none());
     module.def("link", &link_points, "points"_a, "gap"_a, "threads"_a, "cancel"_a.none());
     module.def("instruction_set", [] { return kernels().name; });
+    module.def("choose_instruction_set", &choose_kernels, "name"_a);
 }

@@ -9,13 +9,17 @@
 
 #include "memory.hpp"
 #include "parallel.hpp"
-#include "simd.hpp"
 
 namespace l3ps {
 
+constexpr int LANES = 16;  // points a leaf
 constexpr std::uint32_t NONE = 0xFFFFFFFFu;
 constexpr std::uint32_t LEAF = 0x80000000u;
 constexpr float FAR = 1e30f;  // its square is infinite
+
+#define L3PS_INLINE inline __attribute__((always_inline))
+
+typedef float f32x4 __attribute__((vector_size(16), may_alias));  // every processor has these
 
 // Siblings share a cache line; a search that looks at one looks at both.
 struct alignas(32) Node {

@@ -77,6 +77,8 @@ struct Kernels {
     void (*search)(const Forest&, std::uint32_t first_leaf, std::uint32_t end_leaf);
 };
 
+// The best copy that this processor runs, or the one chosen by name, so that tests can try them all.
 const Kernels& kernels();
+bool choose_kernels(const char* name);
 
 }  // namespace l3ps

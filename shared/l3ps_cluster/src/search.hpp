@@ -2,6 +2,7 @@
 #pragma once
 
 #include "kernels.hpp"
+#include "simd.hpp"
 
 namespace l3ps {
 namespace L3PS_ISA {
@@ -28,7 +29,7 @@ L3PS_INLINE float apart(const Box& box, const Node& node) {
 }
 
 struct Lanes {
-    f32x16 x, y, z;
+    Floats x, y, z;
 };
 
 L3PS_INLINE Lanes lanes_of(const TreeView& tree, std::uint32_t leaf) {
@@ -36,8 +37,8 @@ L3PS_INLINE Lanes lanes_of(const TreeView& tree, std::uint32_t leaf) {
     return {load(tree.x + at), load(tree.y + at), load(tree.z + at)};
 }
 
-L3PS_INLINE f32x16 squared_distance(const Lanes& lanes, float x, float y, float z) {
-    const f32x16 dx = lanes.x - x, dy = lanes.y - y, dz = lanes.z - z;
+L3PS_INLINE Floats squared_distance(const Lanes& lanes, float x, float y, float z) {
+    const Floats dx = lanes.x - all(x), dy = lanes.y - all(y), dz = lanes.z - all(z);
     return (dx * dx + dy * dy) + dz * dz;
 }
 

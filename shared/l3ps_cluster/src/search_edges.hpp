@@ -83,26 +83,26 @@ void propose_known(const Forest& forest, std::uint32_t leaf, std::uint32_t end) 
 // The queries of one leaf, a lane each.
 struct Front {
     Lanes at;
-    f32x16 core;
-    u32x16 component;
-    i32x16 active;
-    f32x16 weight, distance;  // of the lightest edge so far, or what an edge must not exceed; -1 in idle lanes
-    u32x16 to;
+    Floats core;
+    Uints component;
+    Mask active;
+    Floats weight, distance;  // of the lightest edge so far, or what an edge must not exceed; -1 in idle lanes
+    Uints to;
 };
 
 L3PS_INLINE bool scan_edges(const Forest& forest, std::uint32_t leaf, Front& front) {
-    i32x16 changed{};
+    Mask changed = none();
     const std::uint32_t begin = leaf * LANES;
     for (std::uint32_t i = 0; i < LANES; ++i) {
         const std::uint32_t at = begin + i;
-        const f32x16 distance = squared_distance(front.at, forest.tree.x[at], forest.tree.y[at], forest.tree.z[at]);
-        const f32x16 weight = greater(greater(distance, front.core), all(forest.core[at]));
-        const i32x16 better = (front.component != all(forest.component[at])) &
+        const Floats distance = squared_distance(front.at, forest.tree.x[at], forest.tree.y[at], forest.tree.z[at]);
+        const Floats weight = greater(greater(distance, front.core), all(forest.core[at]));
+        const Mask better = (front.component != all(forest.component[at])) &
                               ((weight < front.weight) | ((weight == front.weight) & (distance < front.distance)));
-        front.weight = better ? weight : front.weight;
-        front.distance = better ? distance : front.distance;
-        front.to = better ? all(at) : front.to;
-        changed |= better;
+        front.weight = pick(better, weight, front.weight);
+        front.distance = pick(better, distance, front.distance);
+        front.to = pick(better, all(at), front.to);
+        changed = changed | better;
     }
     return any(changed);
 }
@@ -110,23 +110,25 @@ L3PS_INLINE bool scan_edges(const Forest& forest, std::uint32_t leaf, Front& fro
 // Lanes that know no candidate and whose bound does not exceed the best edge of their component.
 L3PS_INLINE bool gather(const Forest& forest, std::uint32_t leaf, std::uint32_t uniform, Front& front) {
     const std::uint32_t begin = leaf * LANES;
-    const f32x16 bound = load(forest.bound + begin);
-    i32x16 unknown = load(forest.candidate + begin) == NONE;
-    f32x16 limit;
+    const Floats bound = load(forest.bound + begin);
+    const Mask unknown = load(forest.candidate + begin) == all(NONE);
+    Floats limit;
     if (uniform != NONE) {
         limit = all(weight_now(forest.best[uniform]));
     } else {
         const std::uint32_t wanted = bits(unknown);
+        alignas(64) float limits[LANES];
         for (std::uint32_t i = 0; i < LANES; ++i) {
-            limit[i] = wanted >> i & 1 ? weight_now(forest.best[forest.component[begin + i]]) : -1.0f;
+            limits[i] = wanted >> i & 1 ? weight_now(forest.best[forest.component[begin + i]]) : -1.0f;
         }
+        limit = load(limits);
     }
     front.active = unknown & (bound <= limit) & (lane_numbers() < all(forest.tree.count - begin));
     if (!any(front.active)) return false;
     front.at = lanes_of(forest.tree, leaf);
     front.core = load(forest.core + begin);
     front.component = load(forest.component + begin);
-    front.weight = front.active ? limit : all(-1.0f);
+    front.weight = pick(front.active, limit, all(-1.0f));
     front.distance = all(INFINITE);
     front.to = all(NONE);
     return true;
@@ -139,17 +141,17 @@ void search_leaf(const Forest& forest, std::uint32_t leaf) {
     const std::uint32_t begin = leaf * LANES, active = bits(front.active);
     const std::uint32_t first = forest.component[begin + static_cast<std::uint32_t>(__builtin_ctz(active))];
     const bool one = !any(front.active & (front.component != all(first)));  // all queries of one component
-    const float core = smallest(front.active ? front.core : all(INFINITE));
+    const float core = smallest(pick(front.active, front.core, all(INFINITE)));
 
     // Of queries of one component only the lightest edge counts; else each has one to find.
     float weight, distance;
     const auto tighten = [&] {
         if (one) {
-            weight = smallest(front.active ? front.weight : all(INFINITE));
-            distance = smallest(front.weight == weight ? front.distance : all(INFINITE));
+            weight = smallest(pick(front.active, front.weight, all(INFINITE)));
+            distance = smallest(pick(front.weight == all(weight), front.distance, all(INFINITE)));
         } else {
             weight = largest(front.weight);
-            distance = largest(front.weight == weight ? front.distance : all(-1.0f));
+            distance = largest(pick(front.weight == all(weight), front.distance, all(-1.0f)));
         }
     };
     tighten();
@@ -164,17 +166,18 @@ void search_leaf(const Forest& forest, std::uint32_t leaf) {
         });
 
     // No edge that was left out is lighter than (weight, distance).
-    const i32x16 lightest = (front.weight < weight) | ((front.weight == weight) & (front.distance <= distance));
-    const i32x16 known = front.active & (front.to != NONE) & lightest;
-    const f32x16 bound = lesser(front.weight, all(weight));
-    store(forest.bound + begin, front.active ? bound : load(forest.bound + begin));
-    store(forest.candidate + begin, known ? front.to : load(forest.candidate + begin));
+    const Mask lightest =
+        (front.weight < all(weight)) | ((front.weight == all(weight)) & (front.distance <= all(distance)));
+    const Mask known = front.active & (front.to != all(NONE)) & lightest;
+    const Floats bound = lesser(front.weight, all(weight));
+    store(forest.bound + begin, pick(front.active, bound, load(forest.bound + begin)));
+    store(forest.candidate + begin, pick(known, front.to, load(forest.candidate + begin)));
     const std::uint32_t found = bits(known);
     forest.open[leaf] = static_cast<std::uint16_t>(forest.open[leaf] | found);
     for (std::uint32_t left = found; left; left &= left - 1) {
-        const int lane = __builtin_ctz(left);
-        propose(forest, front.component[lane],
-                {front.weight[lane], front.distance[lane], begin + static_cast<std::uint32_t>(lane), front.to[lane]});
+        const auto i = static_cast<std::uint32_t>(__builtin_ctz(left));
+        propose(forest, lane(front.component, i),
+                {lane(front.weight, i), lane(front.distance, i), begin + i, lane(front.to, i)});
     }
 }
 

@@ -10,17 +10,17 @@ namespace {
 // A lane a query: each point of a leaf is compared with sixteen queries at once, and sinks into the sorted lists of
 // those it is near to without a branch. Equal distances keep the order in which they were met.
 struct Lists {
-    f32x16* distance;
-    u32x16* index;
+    Floats* distance;
+    Uints* index;
 
-    L3PS_INLINE void insert(f32x16 found, u32x16 place, int k) const {
+    L3PS_INLINE void insert(Floats found, Uints place, int k) const {
 #pragma GCC unroll 16
         for (int i = k - 1; i > 0; --i) {
-            const i32x16 before = found < distance[i - 1], here = found < distance[i];
-            index[i] = before ? index[i - 1] : (here ? place : index[i]);
+            const Mask before = found < distance[i - 1], here = found < distance[i];
+            index[i] = pick(before, index[i - 1], pick(here, place, index[i]));
             distance[i] = lesser(distance[i], greater(distance[i - 1], found));
         }
-        index[0] = found < distance[0] ? place : index[0];
+        index[0] = pick(found < distance[0], place, index[0]);
         distance[0] = lesser(distance[0], found);
     }
 };
@@ -31,8 +31,8 @@ L3PS_INLINE bool scan(const TreeView& tree, std::uint32_t leaf, const Lanes& que
     const std::uint32_t begin = leaf * LANES;
     for (std::uint32_t i = 0; i < LANES; ++i) {
         const std::uint32_t at = begin + i;
-        f32x16 distance = squared_distance(query, tree.x[at], tree.y[at], tree.z[at]);
-        if (OWN) distance = lane_numbers() == i ? all(INFINITE) : distance;
+        Floats distance = squared_distance(query, tree.x[at], tree.y[at], tree.z[at]);
+        if (OWN) distance = pick(lane_numbers() == all(i), all(INFINITE), distance);
         if (!any(distance < lists.distance[k - 1])) continue;
         lists.insert(distance, all(at), k);
         nearer = true;
@@ -42,9 +42,9 @@ L3PS_INLINE bool scan(const TreeView& tree, std::uint32_t leaf, const Lanes& que
 
 L3PS_INLINE void neighbours_of_leaf(const NeighbourSearch& job, std::uint32_t leaf, const Lists& lists, int k) {
     const Lanes query = lanes_of(job.queries, leaf);
-    const i32x16 real = lane_numbers() < all(job.queries.count - leaf * LANES);
+    const Mask real = lane_numbers() < all(job.queries.count - leaf * LANES);
     for (int i = 0; i < k; ++i) {
-        lists.distance[i] = real ? all(job.limit) : all(-1.0f);  // a place without a point finds and bounds nothing
+        lists.distance[i] = pick(real, all(job.limit), all(-1.0f));  // a place without a point finds and bounds nothing
         lists.index[i] = all(NONE);
     }
     float bound = job.limit;
@@ -63,17 +63,17 @@ L3PS_INLINE void neighbours_of_leaf(const NeighbourSearch& job, std::uint32_t le
     for (int i = 0; i < job.kept; ++i) {
         const std::size_t to = (row * job.kept + i) * LANES;
         if (job.index) store(job.index + to, lists.index[i]);
-        if (job.distance) store(job.distance + to, lists.index[i] == NONE ? all(INFINITE) : lists.distance[i]);
+        if (job.distance) store(job.distance + to, pick(lists.index[i] == all(NONE), all(INFINITE), lists.distance[i]));
     }
-    if (job.last) store(job.last + row * LANES, lists.index[k - 1] == NONE ? all(INFINITE) : lists.distance[k - 1]);
+    if (job.last) store(job.last + row * LANES, pick(lists.index[k - 1] == all(NONE), all(INFINITE), lists.distance[k - 1]));
 }
 
 // With k known to the compiler the lists live in registers.
 template <int K>
 void neighbours_fixed(const NeighbourSearch& job, std::uint32_t leaf, std::uint32_t end) {
     for (; leaf < end; ++leaf) {
-        f32x16 distance[K];
-        u32x16 index[K];
+        Floats distance[K];
+        Uints index[K];
         neighbours_of_leaf(job, leaf, {distance, index}, K);
     }
 }
@@ -87,7 +87,7 @@ void neighbours(const NeighbourSearch& job, std::uint32_t leaf, std::uint32_t en
         case 10: return neighbours_fixed<10>(job, leaf, end);
         default: break;
     }
-    const Lists lists{static_cast<f32x16*>(scratch), static_cast<u32x16*>(scratch) + job.k};
+    const Lists lists{static_cast<Floats*>(scratch), static_cast<Uints*>(scratch) + job.k};
     for (; leaf < end; ++leaf) neighbours_of_leaf(job, leaf, lists, job.k);
 }
 

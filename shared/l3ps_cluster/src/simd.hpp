@@ -1,80 +1,158 @@
-// Sixteen lanes of float and unsigned, in the vector notation that GCC and Clang share.
+// Sixteen lanes of float, unsigned or truth, made of as many registers as the target needs: two with AVX2, four with
+// SSE2 or NEON. (One with AVX-512 was no faster than two.)
 //
-// The compiler lowers them to whatever the target has: one AVX-512 register, two of AVX2, four of SSE2 or NEON. All
-// give the same bits, because the build forbids contraction to fused multiply-add (-ffp-contract=off).
+// Written in the vector notation that GCC and Clang share, but never wider than the target's registers: wider ones GCC
+// takes apart lane by lane. All targets give the same bits, because the build forbids contraction to fused
+// multiply-add (-ffp-contract=off).
 #pragma once
 
-#include <cstdint>
+#include "kdtree.hpp"
 
 #if defined(__x86_64__)
 #include <immintrin.h>
 #endif
 
 namespace l3ps {
+namespace L3PS_ISA {
 
-constexpr int LANES = 16;  // points a leaf of the tree, one cache line of each coordinate
-
-typedef float f32x16 __attribute__((vector_size(64)));
-typedef std::int32_t i32x16 __attribute__((vector_size(64)));
-typedef std::uint32_t u32x16 __attribute__((vector_size(64)));
-typedef float f32x4 __attribute__((vector_size(16)));
-
-#define L3PS_INLINE inline __attribute__((always_inline))
-
-L3PS_INLINE f32x16 load(const float* from) { return *reinterpret_cast<const f32x16*>(from); }
-L3PS_INLINE u32x16 load(const std::uint32_t* from) { return *reinterpret_cast<const u32x16*>(from); }
-L3PS_INLINE void store(float* to, f32x16 value) { *reinterpret_cast<f32x16*>(to) = value; }
-L3PS_INLINE void store(std::uint32_t* to, u32x16 value) { *reinterpret_cast<u32x16*>(to) = value; }
-L3PS_INLINE f32x16 all(float value) { return value - f32x16{}; }
-L3PS_INLINE u32x16 all(std::uint32_t value) { return value - u32x16{}; }
-L3PS_INLINE u32x16 lane_numbers() { return u32x16{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}; }
-
-L3PS_INLINE f32x16 lesser(f32x16 a, f32x16 b) {
-#if defined(__AVX512F__)
-    return reinterpret_cast<f32x16>(_mm512_min_ps(reinterpret_cast<__m512>(a), reinterpret_cast<__m512>(b)));
+// L3PS_EACH_PART(statement) repeats the statement for every register i, spelled out: of a loop, GCC keeps the registers
+// in memory.
+#define L3PS_PART(I, ...)    \
+    {                        \
+        constexpr int i = I; \
+        __VA_ARGS__;         \
+    }
+#if defined(__AVX2__)
+#define L3PS_BYTES 32
+#define L3PS_EACH_PART(...) L3PS_PART(0, __VA_ARGS__) L3PS_PART(1, __VA_ARGS__)
 #else
-    return a < b ? a : b;
+#define L3PS_BYTES 16
+#define L3PS_EACH_PART(...) \
+    L3PS_PART(0, __VA_ARGS__) L3PS_PART(1, __VA_ARGS__) L3PS_PART(2, __VA_ARGS__) L3PS_PART(3, __VA_ARGS__)
 #endif
+constexpr int PARTS = 64 / L3PS_BYTES, WIDTH = L3PS_BYTES / 4;
+
+template <typename T>
+struct Lanes16 {
+    typedef T Part __attribute__((vector_size(L3PS_BYTES), may_alias));
+    Part part[PARTS];
+};
+using Floats = Lanes16<float>;
+using Uints = Lanes16<std::uint32_t>;
+using Mask = Lanes16<std::int32_t>;
+
+#define L3PS_OPERATOR(RESULT, OPERAND, SIGN)                              \
+    L3PS_INLINE RESULT operator SIGN(const OPERAND& a, const OPERAND& b) { \
+        RESULT out;                                                       \
+        L3PS_EACH_PART(out.part[i] = a.part[i] SIGN b.part[i])            \
+        return out;                                                       \
+    }
+L3PS_OPERATOR(Floats, Floats, +)
+L3PS_OPERATOR(Floats, Floats, -)
+L3PS_OPERATOR(Floats, Floats, *)
+L3PS_OPERATOR(Mask, Floats, <)
+L3PS_OPERATOR(Mask, Floats, <=)
+L3PS_OPERATOR(Mask, Floats, ==)
+L3PS_OPERATOR(Mask, Uints, <)
+L3PS_OPERATOR(Mask, Uints, ==)
+L3PS_OPERATOR(Mask, Uints, !=)
+L3PS_OPERATOR(Mask, Mask, &)
+L3PS_OPERATOR(Mask, Mask, |)
+#undef L3PS_OPERATOR
+
+L3PS_INLINE Floats all(float value) {
+    Floats out;
+    L3PS_EACH_PART(out.part[i] = value - Floats::Part{})
+    return out;
+}
+L3PS_INLINE Uints all(std::uint32_t value) {
+    Uints out;
+    L3PS_EACH_PART(out.part[i] = value - Uints::Part{})
+    return out;
+}
+L3PS_INLINE Mask none() { return Mask{}; }
+
+// From and to cache lines.
+template <typename T>
+L3PS_INLINE Lanes16<T> load(const T* from) {
+    Lanes16<T> out;
+    L3PS_EACH_PART(out.part[i] = reinterpret_cast<const typename Lanes16<T>::Part*>(from)[i])
+    return out;
+}
+template <typename T>
+L3PS_INLINE void store(T* to, const Lanes16<T>& value) {
+    L3PS_EACH_PART(reinterpret_cast<typename Lanes16<T>::Part*>(to)[i] = value.part[i])
 }
 
-L3PS_INLINE f32x16 greater(f32x16 a, f32x16 b) {
-#if defined(__AVX512F__)
-    return reinterpret_cast<f32x16>(_mm512_max_ps(reinterpret_cast<__m512>(a), reinterpret_cast<__m512>(b)));
-#else
-    return a > b ? a : b;
-#endif
+L3PS_INLINE Uints lane_numbers() {
+    alignas(64) static constexpr std::uint32_t NUMBERS[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    return load(NUMBERS);
 }
 
-// Bit i of the result is set where lane i of a comparison's result is.
-L3PS_INLINE std::uint32_t bits(i32x16 mask) {
-#if defined(__AVX512DQ__)
-    return _mm512_movepi32_mask(reinterpret_cast<__m512i>(mask));
-#elif defined(__AVX2__)
-    union { i32x16 whole; __m256 half[2]; } split{mask};
-    return static_cast<std::uint32_t>(_mm256_movemask_ps(split.half[0]) | (_mm256_movemask_ps(split.half[1]) << 8));
+// Lane by lane: a where the mask is set, else b.
+template <typename T>
+L3PS_INLINE Lanes16<T> pick(const Mask& mask, const Lanes16<T>& a, const Lanes16<T>& b) {
+    Lanes16<T> out;
+    L3PS_EACH_PART(out.part[i] = mask.part[i] ? a.part[i] : b.part[i])
+    return out;
+}
+
+// One register: the lesser and the greater of two lanes, and the sign bits of all lanes.
+using FloatPart = Floats::Part;
+using MaskPart = Mask::Part;
+#if defined(__AVX2__)
+L3PS_INLINE FloatPart part_min(FloatPart a, FloatPart b) { return FloatPart(_mm256_min_ps(__m256(a), __m256(b))); }
+L3PS_INLINE FloatPart part_max(FloatPart a, FloatPart b) { return FloatPart(_mm256_max_ps(__m256(a), __m256(b))); }
+L3PS_INLINE std::uint32_t part_bits(MaskPart mask) { return std::uint32_t(_mm256_movemask_ps(__m256(mask))); }
 #elif defined(__SSE2__)
-    union { i32x16 whole; __m128 part[4]; } split{mask};
-    return static_cast<std::uint32_t>(_mm_movemask_ps(split.part[0]) | (_mm_movemask_ps(split.part[1]) << 4) |
-                                      (_mm_movemask_ps(split.part[2]) << 8) | (_mm_movemask_ps(split.part[3]) << 12));
+L3PS_INLINE FloatPart part_min(FloatPart a, FloatPart b) { return FloatPart(_mm_min_ps(__m128(a), __m128(b))); }
+L3PS_INLINE FloatPart part_max(FloatPart a, FloatPart b) { return FloatPart(_mm_max_ps(__m128(a), __m128(b))); }
+L3PS_INLINE std::uint32_t part_bits(MaskPart mask) { return std::uint32_t(_mm_movemask_ps(__m128(mask))); }
 #else
+L3PS_INLINE FloatPart part_min(FloatPart a, FloatPart b) { return a < b ? a : b; }
+L3PS_INLINE FloatPart part_max(FloatPart a, FloatPart b) { return a > b ? a : b; }
+L3PS_INLINE std::uint32_t part_bits(MaskPart mask) {
     std::uint32_t out = 0;
-    for (int i = 0; i < LANES; ++i) out |= (mask[i] ? 1u : 0u) << i;
+    for (int lane = 0; lane < WIDTH; ++lane) out |= (mask[lane] ? 1u : 0u) << lane;
     return out;
+}
 #endif
+
+L3PS_INLINE Floats lesser(const Floats& a, const Floats& b) {
+    Floats out;
+    L3PS_EACH_PART(out.part[i] = part_min(a.part[i], b.part[i]))
+    return out;
+}
+L3PS_INLINE Floats greater(const Floats& a, const Floats& b) {
+    Floats out;
+    L3PS_EACH_PART(out.part[i] = part_max(a.part[i], b.part[i]))
+    return out;
+}
+// Bit i of the result is lane i of the mask.
+L3PS_INLINE std::uint32_t bits(const Mask& mask) {
+    std::uint32_t out = 0;
+    L3PS_EACH_PART(out |= part_bits(mask.part[i]) << (i * WIDTH))
+    return out;
+}
+L3PS_INLINE bool any(const Mask& mask) { return bits(mask) != 0; }
+
+template <typename T>
+L3PS_INLINE T lane(const Lanes16<T>& value, std::uint32_t at) {
+    return value.part[at / WIDTH][at % WIDTH];
 }
 
-L3PS_INLINE bool any(i32x16 mask) { return bits(mask) != 0; }
-
-L3PS_INLINE float largest(f32x16 value) {
-#if defined(__AVX512F__)
-    return _mm512_reduce_max_ps(reinterpret_cast<__m512>(value));
-#else
-    float out = value[0];
-    for (int i = 1; i < LANES; ++i) out = value[i] > out ? value[i] : out;
-    return out;
-#endif
+L3PS_INLINE float smallest(const Floats& value) {
+    union {
+        Floats whole;
+        f32x4 quarter[4];
+    } split{value};
+    const f32x4 a = split.quarter[0] < split.quarter[1] ? split.quarter[0] : split.quarter[1];
+    const f32x4 b = split.quarter[2] < split.quarter[3] ? split.quarter[2] : split.quarter[3];
+    const f32x4 c = a < b ? a : b;
+    const float low = c[0] < c[1] ? c[0] : c[1], high = c[2] < c[3] ? c[2] : c[3];
+    return low < high ? low : high;
 }
+L3PS_INLINE float largest(const Floats& value) { return -smallest(all(0.0f) - value); }
 
-L3PS_INLINE float smallest(f32x16 value) { return -largest(-value); }
-
+}  // namespace L3PS_ISA
 }  // namespace l3ps

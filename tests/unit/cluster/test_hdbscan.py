@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from l3ps_cluster import HDBSCAN
+from l3ps_cluster import HDBSCAN, _core
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -149,3 +149,19 @@ def test_other_threads_run_meanwhile_and_cancel_may_let_it_go_on(rng):
     assert len(seen) >= 2
     assert all(np.diff(seen) > 100)
     np.testing.assert_array_equal(found, HDBSCAN(5, threads=2).fit_predict(points))
+
+
+def test_the_result_does_not_depend_on_the_processor(rng):
+    """The copy of the loops for any processor and the one for this one's."""
+    points = street(rng, 5000)
+    best = _core.instruction_set()
+    expected = HDBSCAN(5, keep_tree=True).fit(points)
+    try:
+        assert _core.choose_instruction_set("baseline")
+        found = HDBSCAN(5, keep_tree=True).fit(points)
+    finally:
+        assert _core.choose_instruction_set(best)
+    assert not _core.choose_instruction_set("abacus")
+    np.testing.assert_array_equal(found.labels_, expected.labels_)
+    np.testing.assert_array_equal(found.tree_[0], expected.tree_[0])
+    assert found.tree_weight_ == expected.tree_weight_
