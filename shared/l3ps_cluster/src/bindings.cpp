@@ -51,7 +51,8 @@ Frame frame_of(const Rows<T>& points, Team& team) {
 }
 
 template <typename T>
-nb::tuple hdbscan(Rows<T> points, std::uint32_t min_cluster_size, int min_samples, bool keep_tree, int threads, nb::object cancel) {
+nb::tuple hdbscan(Rows<T> points, std::uint32_t min_cluster_size, int min_samples, bool keep_tree, int threads,
+                  nb::object cancel) {
     const std::size_t count = points.shape(0), kept = keep_tree && count ? count - 1 : 0;
     Result<std::int32_t> labels(count), ends(kept, 2);
     Result<double> weights(kept);
@@ -60,8 +61,8 @@ nb::tuple hdbscan(Rows<T> points, std::uint32_t min_cluster_size, int min_sample
     supervise(team, cancel, [&] {
         Tree tree = tree_of(points, frame_of(points, team), team);
         Array<Edge> edges = spanning_tree(tree, neighbourhood(tree, min_samples, team), team);
-        sort_edges(edges, tree.original);
-        label_points(edges, tree, min_cluster_size, labels.data());
+        sort_edges(edges, tree.original, team);
+        label_points(edges, tree, min_cluster_size, labels.data(), team);
         for (std::size_t i = 0; i < edges.size(); ++i) {
             const double weight = std::sqrt(double(edges[i].weight)) * tree.scale;
             total += weight;
@@ -74,7 +75,8 @@ nb::tuple hdbscan(Rows<T> points, std::uint32_t min_cluster_size, int min_sample
     return nb::make_tuple(labels.give(), total, ends.give(), weights.give());
 }
 
-nb::tuple nearest_points(Rows<float> points, Rows<float> queries, int k, double max_distance, int threads, nb::object cancel) {
+nb::tuple nearest_points(Rows<float> points, Rows<float> queries, int k, double max_distance, int threads,
+                         nb::object cancel) {
     Result<float> distance(queries.shape(0), k);
     Result<std::int32_t> index(queries.shape(0), k);
     Team team(threads);
@@ -102,7 +104,8 @@ nb::ndarray<nb::numpy, std::int32_t> fill(Rows<T> points, Labels labels, int k, 
     Result<std::int32_t> filled(points.shape(0));
     Team team(threads);
     supervise(team, cancel, [&] {
-        fill_noise(points.data(), points.shape(0), static_cast<int>(points.shape(1)), labels.data(), k, filled.data(), team);
+        fill_noise(points.data(), points.shape(0), static_cast<int>(points.shape(1)), labels.data(), k, filled.data(),
+                   team);
     });
     return filled.give();
 }
@@ -119,7 +122,8 @@ void define(nb::module_& module) {
 NB_MODULE(_core, module) {
     define<float>(module);
     define<double>(module);
-    module.def("nearest", &nearest_points, "points"_a, "queries"_a, "k"_a, "max_distance"_a, "threads"_a, "cancel"_a.none());
+    module.def("nearest", &nearest_points, "points"_a, "queries"_a, "k"_a, "max_distance"_a, "threads"_a,
+               "cancel"_a.none());
     module.def("link", &link_points, "points"_a, "gap"_a, "threads"_a, "cancel"_a.none());
     module.def("instruction_set", [] { return kernels().name; });
     module.def("choose_instruction_set", &choose_kernels, "name"_a);

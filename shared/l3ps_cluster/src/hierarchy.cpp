@@ -22,9 +22,9 @@ struct Cluster {
 
 // A component of the merges so far; one entry a place, meaningful for the component's representative.
 struct Component {
-    std::uint32_t parent;   // towards the representative
+    std::uint32_t parent;  // towards the representative
     std::uint32_t size;
-    std::uint32_t next;     // ring of the points of a component that is smaller than a cluster
+    std::uint32_t next;  // ring of the points of a component that is smaller than a cluster
     std::uint32_t cluster;
 };
 
@@ -41,11 +41,14 @@ public:
         for (std::uint32_t i = 0; i < tree.count; ++i) components_[i] = {i, 1, i, NONE};
     }
 
-    void condense(const Array<Edge>& edges) {
+    void condense(const Array<Edge>& edges, const Team& team) {
         std::size_t i = 0;
         for (; i < edges.size() && edges[i].weight == 0; ++i) coincide(edges[i]);
         settle();
-        for (; i < edges.size(); ++i) merge(edges[i]);
+        for (; i < edges.size(); ++i) {
+            if (i % 65536 == 0) team.check();
+            merge(edges[i]);
+        }
     }
 
     // Excess of mass, from the leaves of the condensed tree up; its root is never a cluster. As in the package, sums of
@@ -182,7 +185,7 @@ struct Key {
 
 }  // namespace
 
-void sort_edges(Array<Edge>& edges, const Array<std::uint32_t>& original) {
+void sort_edges(Array<Edge>& edges, const Array<std::uint32_t>& original, const Team& team) {
     // Floats that are not negative sort like their bits: three passes of eleven bits.
     Array<Key> keys(edges.size()), other(edges.size());
     for (std::size_t i = 0; i < edges.size(); ++i) {
@@ -190,6 +193,7 @@ void sort_edges(Array<Edge>& edges, const Array<std::uint32_t>& original) {
         keys[i].edge = static_cast<std::uint32_t>(i);
     }
     for (int shift = 0; shift < 33; shift += 11) {
+        team.check();
         std::vector<std::size_t> start(2048 + 1);
         for (const Key& key : keys) ++start[(key.weight >> shift & 2047) + 1];
         for (int i = 0; i < 2048; ++i) start[i + 1] += start[i];
@@ -211,9 +215,10 @@ void sort_edges(Array<Edge>& edges, const Array<std::uint32_t>& original) {
     edges.swap(sorted);
 }
 
-void label_points(const Array<Edge>& edges, const Tree& tree, std::uint32_t min_cluster_size, std::int32_t* labels) {
+void label_points(const Array<Edge>& edges, const Tree& tree, std::uint32_t min_cluster_size, std::int32_t* labels,
+                  const Team& team) {
     Condenser condenser(tree, min_cluster_size);
-    condenser.condense(edges);
+    condenser.condense(edges, team);
     condenser.select();
     condenser.label(labels);
 }

@@ -142,11 +142,13 @@ Tree build_tree(const Real* from, std::size_t count, int dimensions, const Frame
 
     Builder builder(tree, points);
     std::vector<Task> front{{0, 2, 0, tree.leaves}};
-    // The same splits whatever the number of threads: those near the root one level at a time, the rest one subtree each.
+    // The same splits whatever the number of threads: those near the root one level at a time, the rest one subtree
+    // each.
     while (!front.empty() && front.size() < 8 * std::size_t(team.threads())) {
         std::vector<Task> halves(2 * front.size());
         std::vector<char> inner(front.size());
-        team.over(front.size(), 1, [&](std::size_t i, std::size_t) { inner[i] = builder.split(front[i], &halves[2 * i]); });
+        team.over(front.size(), 1,
+                  [&](std::size_t i, std::size_t) { inner[i] = builder.split(front[i], &halves[2 * i]); });
         std::vector<Task> next;
         for (std::size_t i = 0; i < front.size(); ++i) {
             if (inner[i]) next.insert(next.end(), {halves[2 * i], halves[2 * i + 1]});

@@ -19,21 +19,21 @@ struct TreeView {
 };
 
 inline TreeView view(const Tree& tree) {
-    return {tree.x.data(),     tree.y.data(),        tree.z.data(), tree.nodes.data(),
-            tree.leaf_node.data(), tree.count, tree.leaves};
+    return {tree.x.data(),         tree.y.data(), tree.z.data(), tree.nodes.data(),
+            tree.leaf_node.data(), tree.count,    tree.leaves};
 }
 
 // Nearest neighbours of the points of `queries` among those of `tree`; both may be one tree.
 struct NeighbourSearch {
     TreeView tree, queries;
-    bool same;            // queries are the tree's own points: none is its own neighbour
-    int k;                // neighbours looked for
-    int kept;             // of which the indices are written
+    bool same;                    // queries are the tree's own points: none is its own neighbour
+    int k;                        // neighbours looked for
+    int kept;                     // of which the indices are written
     std::uint32_t first_written;  // leaf at which the arrays below begin
-    float limit;          // squared distance from which on a point is no neighbour
-    float* distance;      // out: squared, [leaf][kept][lane], may be null
-    float* last;          // out: squared distance of the k-th, [place], infinite where there is none; may be null
-    std::uint32_t* index; // out: places, [leaf][kept][lane], NONE where there is none; may be null
+    float limit;                  // squared distance from which on a point is no neighbour
+    float* distance;              // out: squared, [leaf][kept][lane], may be null
+    float* last;           // out: squared distance of the k-th, [place], infinite where there is none; may be null
+    std::uint32_t* index;  // out: places, [leaf][kept][lane], NONE where there is none; may be null
 };
 
 // The lightest edge found so far that leaves a component. Edges are compared by weight, then by distance, then by
@@ -58,15 +58,15 @@ constexpr int LOCKS = 4096;
 // State of the spanning tree between rounds; arrays by place unless they say otherwise.
 struct Forest {
     TreeView tree;
-    const float* core;              // squared core distance
-    const std::uint32_t* near;      // [leaf][kept][lane] nearest neighbours
+    const float* core;          // squared core distance
+    const std::uint32_t* near;  // [leaf][kept][lane] nearest neighbours
     int kept;
-    const std::uint32_t* component; // number of the component: a place in it
-    float* bound;                   // every edge of the point to another component weighs at least this
-    std::uint32_t* candidate;       // the other end of its lightest such edge, NONE where unknown
-    std::uint16_t* open;            // [leaf] lanes some of whose nearest neighbours lie in other components
-    Edge* best;                     // [component]
-    std::uint8_t* locks;            // [LOCKS]
+    const std::uint32_t* component;  // number of the component: a place in it
+    float* bound;                    // every edge of the point to another component weighs at least this
+    std::uint32_t* candidate;        // the other end of its lightest such edge, NONE where unknown
+    std::uint16_t* open;             // [leaf] lanes some of whose nearest neighbours lie in other components
+    Edge* best;                      // [component]
+    std::uint8_t* locks;             // [LOCKS]
 };
 
 struct Kernels {

@@ -11,7 +11,12 @@ namespace {
 class Linker {
 public:
     Linker(const Tree& tree, float limit, Team& team)
-        : tree_(tree), limit_(limit), team_(team), parent_(tree.count), whole_(tree.nodes.size(), 0), first_(tree.nodes.size(), 0) {
+        : tree_(tree),
+          limit_(limit),
+          team_(team),
+          parent_(tree.count),
+          whole_(tree.nodes.size(), 0),
+          first_(tree.nodes.size(), 0) {
         for (std::uint32_t i = 0; i < tree.count; ++i) parent_[i] = i;
         for (std::size_t i = tree.nodes.size(); i-- > 0;) {  // children come after their parents
             if (i == 1) continue;
@@ -120,7 +125,8 @@ private:
         for (std::uint32_t i = b; i < end_of(b); ++i) {
             float distance[LANES];
             for (std::uint32_t lane = 0; lane < LANES; ++lane) {
-                const float dx = tree_.x[a + lane] - tree_.x[i], dy = tree_.y[a + lane] - tree_.y[i], dz = tree_.z[a + lane] - tree_.z[i];
+                const float dx = tree_.x[a + lane] - tree_.x[i], dy = tree_.y[a + lane] - tree_.y[i],
+                            dz = tree_.z[a + lane] - tree_.z[i];
                 distance[lane] = (dx * dx + dy * dy) + dz * dz;
             }
             for (std::uint32_t lane = 0; lane < LANES; ++lane) {

@@ -29,7 +29,8 @@ private:
         const Node& node = tree_.nodes[number];
         double gap = 0;
         for (int axis = 0; axis < 3; ++axis) {
-            const double outside = std::max({double(node.low[axis]) - at_[axis], at_[axis] - double(node.high[axis]), 0.0});
+            const double outside =
+                std::max({double(node.low[axis]) - at_[axis], at_[axis] - double(node.high[axis]), 0.0});
             gap += outside * outside;
         }
         if (gap > (found_.size() == k_ ? found_.back().first : reach_)) return;
@@ -85,7 +86,8 @@ void search(const Tree& tree, const Tree& queries, int k, float limit, Team& tea
 
 }  // namespace
 
-void nearest(const Tree& tree, const Tree& queries, int k, float limit, float* distance, std::int32_t* index, Team& team) {
+void nearest(const Tree& tree, const Tree& queries, int k, float limit, float* distance, std::int32_t* index,
+             Team& team) {
     if (tree.count == 0) {
         for (std::size_t i = 0; i < std::size_t(queries.count) * k; ++i) distance[i] = INFINITE, index[i] = -1;
         return;
@@ -105,17 +107,19 @@ namespace {
 // Each query's k nearest points by float64 distance, then index: use(query, indices). The tree has k points or more.
 template <typename Use>
 void nearest_exactly(const Tree& tree, const Tree& queries, int k, Team& team, Use&& use) {
-    search(tree, queries, k + 1, INFINITE, team, [&](std::uint32_t place, const float* squared, const std::uint32_t* found) {
-        std::vector<std::uint32_t> row(static_cast<std::size_t>(k));
-        const float last = squared[(k - 1) * LANES], next = squared[k * LANES];
-        if (next <= last * (1 + SLACK)) {
-            const ExactSearch exact(tree, queries.x[place], queries.y[place], queries.z[place], row.size(), last);
-            for (std::size_t i = 0; i < row.size(); ++i) row[i] = exact.index(i);
-        } else {
-            for (std::size_t i = 0; i < row.size(); ++i) row[i] = tree.original[found[i * LANES]];
-        }
-        use(queries.original[place], row);
-    });
+    search(tree, queries, k + 1, INFINITE, team,
+           [&](std::uint32_t place, const float* squared, const std::uint32_t* found) {
+               std::vector<std::uint32_t> row(static_cast<std::size_t>(k));
+               const float last = squared[(k - 1) * LANES], next = squared[k * LANES];
+               if (next <= last * (1 + SLACK)) {
+                   const ExactSearch exact(tree, queries.x[place], queries.y[place], queries.z[place], row.size(),
+                                           last);
+                   for (std::size_t i = 0; i < row.size(); ++i) row[i] = exact.index(i);
+               } else {
+                   for (std::size_t i = 0; i < row.size(); ++i) row[i] = tree.original[found[i * LANES]];
+               }
+               use(queries.original[place], row);
+           });
 }
 
 std::int32_t most_frequent(std::vector<std::int32_t>& labels) {
@@ -144,15 +148,17 @@ void fill_noise(const Real* points, std::size_t count, int dimensions, const std
     const Frame frame = frame_of(points, count, dimensions, team);
     const auto tree_of = [&](const std::vector<std::uint32_t>& chosen) {
         Array<Real> rows(chosen.size() * dimensions);
-        for (std::size_t i = 0; i < rows.size(); ++i) rows[i] = points[std::size_t(chosen[i / dimensions]) * dimensions + i % dimensions];
+        for (std::size_t i = 0; i < rows.size(); ++i)
+            rows[i] = points[std::size_t(chosen[i / dimensions]) * dimensions + i % dimensions];
         return build_tree(rows.data(), chosen.size(), dimensions, frame, team);
     };
     const int wanted = static_cast<int>(std::min<std::size_t>(k, clustered.size()));
-    nearest_exactly(tree_of(clustered), tree_of(noise), wanted, team, [&](std::uint32_t query, const std::vector<std::uint32_t>& found) {
-        std::vector<std::int32_t> votes;
-        for (const std::uint32_t at : found) votes.push_back(labels[clustered[at]]);
-        filled[noise[query]] = most_frequent(votes);
-    });
+    nearest_exactly(tree_of(clustered), tree_of(noise), wanted, team,
+                    [&](std::uint32_t query, const std::vector<std::uint32_t>& found) {
+                        std::vector<std::int32_t> votes;
+                        for (const std::uint32_t at : found) votes.push_back(labels[clustered[at]]);
+                        filled[noise[query]] = most_frequent(votes);
+                    });
 }
 
 template void fill_noise<float>(const float*, std::size_t, int, const std::int32_t*, int, std::int32_t*, Team&);

@@ -7,7 +7,8 @@ namespace l3ps {
 
 // Squared distances and the caller's indices of each query's k nearest points within `limit` (squared), row after row
 // in the caller's order of the queries; infinite and -1 where there are no more.
-void nearest(const Tree& tree, const Tree& queries, int k, float limit, float* distance, std::int32_t* index, Team& team);
+void nearest(const Tree& tree, const Tree& queries, int k, float limit, float* distance, std::int32_t* index,
+             Team& team);
 
 // Labels (by the caller's index, -1 for noise), where noise takes the most frequent label of its k nearest points that
 // have one; of equally frequent ones the lowest. Distances count in float64, ties go to the lower index.

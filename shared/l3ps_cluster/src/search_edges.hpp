@@ -98,7 +98,7 @@ L3PS_INLINE bool scan_edges(const Forest& forest, std::uint32_t leaf, Front& fro
         const Floats distance = squared_distance(front.at, forest.tree.x[at], forest.tree.y[at], forest.tree.z[at]);
         const Floats weight = greater(greater(distance, front.core), all(forest.core[at]));
         const Mask better = (front.component != all(forest.component[at])) &
-                              ((weight < front.weight) | ((weight == front.weight) & (distance < front.distance)));
+                            ((weight < front.weight) | ((weight == front.weight) & (distance < front.distance)));
         front.weight = pick(better, weight, front.weight);
         front.distance = pick(better, distance, front.distance);
         front.to = pick(better, all(at), front.to);
@@ -111,7 +111,8 @@ L3PS_INLINE bool scan_edges(const Forest& forest, std::uint32_t leaf, Front& fro
 L3PS_INLINE bool gather(const Forest& forest, std::uint32_t leaf, std::uint32_t uniform, Front& front) {
     const std::uint32_t begin = leaf * LANES;
     const Floats bound = load(forest.bound + begin);
-    const Mask unknown = load(forest.candidate + begin) == all(NONE);
+    const Mask real = lane_numbers() < all(forest.tree.count - begin);
+    const Mask unknown = real & (load(forest.candidate + begin) == all(NONE));
     Floats limit;
     if (uniform != NONE) {
         limit = all(weight_now(forest.best[uniform]));
@@ -123,7 +124,7 @@ L3PS_INLINE bool gather(const Forest& forest, std::uint32_t leaf, std::uint32_t 
         }
         limit = load(limits);
     }
-    front.active = unknown & (bound <= limit) & (lane_numbers() < all(forest.tree.count - begin));
+    front.active = unknown & (bound <= limit);
     if (!any(front.active)) return false;
     front.at = lanes_of(forest.tree, leaf);
     front.core = load(forest.core + begin);

@@ -65,7 +65,8 @@ L3PS_INLINE void neighbours_of_leaf(const NeighbourSearch& job, std::uint32_t le
         if (job.index) store(job.index + to, lists.index[i]);
         if (job.distance) store(job.distance + to, pick(lists.index[i] == all(NONE), all(INFINITE), lists.distance[i]));
     }
-    if (job.last) store(job.last + row * LANES, pick(lists.index[k - 1] == all(NONE), all(INFINITE), lists.distance[k - 1]));
+    if (job.last)
+        store(job.last + row * LANES, pick(lists.index[k - 1] == all(NONE), all(INFINITE), lists.distance[k - 1]));
 }
 
 // With k known to the compiler the lists live in registers.
@@ -80,12 +81,18 @@ void neighbours_fixed(const NeighbourSearch& job, std::uint32_t leaf, std::uint3
 
 void neighbours(const NeighbourSearch& job, std::uint32_t leaf, std::uint32_t end, void* scratch) {
     switch (job.k) {
-        case 1: return neighbours_fixed<1>(job, leaf, end);
-        case 3: return neighbours_fixed<3>(job, leaf, end);
-        case 4: return neighbours_fixed<4>(job, leaf, end);
-        case 5: return neighbours_fixed<5>(job, leaf, end);
-        case 10: return neighbours_fixed<10>(job, leaf, end);
-        default: break;
+        case 1:
+            return neighbours_fixed<1>(job, leaf, end);
+        case 3:
+            return neighbours_fixed<3>(job, leaf, end);
+        case 4:
+            return neighbours_fixed<4>(job, leaf, end);
+        case 5:
+            return neighbours_fixed<5>(job, leaf, end);
+        case 10:
+            return neighbours_fixed<10>(job, leaf, end);
+        default:
+            break;
     }
     const Lists lists{static_cast<Floats*>(scratch), static_cast<Uints*>(scratch) + job.k};
     for (; leaf < end; ++leaf) neighbours_of_leaf(job, leaf, lists, job.k);

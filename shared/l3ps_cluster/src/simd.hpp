@@ -24,12 +24,16 @@ namespace L3PS_ISA {
     }
 #if defined(__AVX2__)
 #define L3PS_BYTES 32
-#define L3PS_EACH_PART(...) L3PS_PART(0, __VA_ARGS__) L3PS_PART(1, __VA_ARGS__)
+#define L3PS_PARTS(...) L3PS_PART(0, __VA_ARGS__) L3PS_PART(1, __VA_ARGS__)
 #else
 #define L3PS_BYTES 16
-#define L3PS_EACH_PART(...) \
+#define L3PS_PARTS(...) \
     L3PS_PART(0, __VA_ARGS__) L3PS_PART(1, __VA_ARGS__) L3PS_PART(2, __VA_ARGS__) L3PS_PART(3, __VA_ARGS__)
 #endif
+#define L3PS_EACH_PART(...)     \
+    do {                        \
+        L3PS_PARTS(__VA_ARGS__) \
+    } while (false)
 constexpr int PARTS = 64 / L3PS_BYTES, WIDTH = L3PS_BYTES / 4;
 
 template <typename T>
@@ -41,11 +45,11 @@ using Floats = Lanes16<float>;
 using Uints = Lanes16<std::uint32_t>;
 using Mask = Lanes16<std::int32_t>;
 
-#define L3PS_OPERATOR(RESULT, OPERAND, SIGN)                              \
+#define L3PS_OPERATOR(RESULT, OPERAND, SIGN)                               \
     L3PS_INLINE RESULT operator SIGN(const OPERAND& a, const OPERAND& b) { \
-        RESULT out;                                                       \
-        L3PS_EACH_PART(out.part[i] = a.part[i] SIGN b.part[i])            \
-        return out;                                                       \
+        RESULT out;                                                        \
+        L3PS_EACH_PART(out.part[i] = a.part[i] SIGN b.part[i]);            \
+        return out;                                                        \
     }
 L3PS_OPERATOR(Floats, Floats, +)
 L3PS_OPERATOR(Floats, Floats, -)
@@ -62,12 +66,12 @@ L3PS_OPERATOR(Mask, Mask, |)
 
 L3PS_INLINE Floats all(float value) {
     Floats out;
-    L3PS_EACH_PART(out.part[i] = value - Floats::Part{})
+    L3PS_EACH_PART(out.part[i] = value - Floats::Part{});
     return out;
 }
 L3PS_INLINE Uints all(std::uint32_t value) {
     Uints out;
-    L3PS_EACH_PART(out.part[i] = value - Uints::Part{})
+    L3PS_EACH_PART(out.part[i] = value - Uints::Part{});
     return out;
 }
 L3PS_INLINE Mask none() { return Mask{}; }
@@ -76,12 +80,12 @@ L3PS_INLINE Mask none() { return Mask{}; }
 template <typename T>
 L3PS_INLINE Lanes16<T> load(const T* from) {
     Lanes16<T> out;
-    L3PS_EACH_PART(out.part[i] = reinterpret_cast<const typename Lanes16<T>::Part*>(from)[i])
+    L3PS_EACH_PART(out.part[i] = reinterpret_cast<const typename Lanes16<T>::Part*>(from)[i]);
     return out;
 }
 template <typename T>
 L3PS_INLINE void store(T* to, const Lanes16<T>& value) {
-    L3PS_EACH_PART(reinterpret_cast<typename Lanes16<T>::Part*>(to)[i] = value.part[i])
+    L3PS_EACH_PART(reinterpret_cast<typename Lanes16<T>::Part*>(to)[i] = value.part[i]);
 }
 
 L3PS_INLINE Uints lane_numbers() {
@@ -93,7 +97,7 @@ L3PS_INLINE Uints lane_numbers() {
 template <typename T>
 L3PS_INLINE Lanes16<T> pick(const Mask& mask, const Lanes16<T>& a, const Lanes16<T>& b) {
     Lanes16<T> out;
-    L3PS_EACH_PART(out.part[i] = mask.part[i] ? a.part[i] : b.part[i])
+    L3PS_EACH_PART(out.part[i] = mask.part[i] ? a.part[i] : b.part[i]);
     return out;
 }
 
@@ -120,18 +124,18 @@ L3PS_INLINE std::uint32_t part_bits(MaskPart mask) {
 
 L3PS_INLINE Floats lesser(const Floats& a, const Floats& b) {
     Floats out;
-    L3PS_EACH_PART(out.part[i] = part_min(a.part[i], b.part[i]))
+    L3PS_EACH_PART(out.part[i] = part_min(a.part[i], b.part[i]));
     return out;
 }
 L3PS_INLINE Floats greater(const Floats& a, const Floats& b) {
     Floats out;
-    L3PS_EACH_PART(out.part[i] = part_max(a.part[i], b.part[i]))
+    L3PS_EACH_PART(out.part[i] = part_max(a.part[i], b.part[i]));
     return out;
 }
 // Bit i of the result is lane i of the mask.
 L3PS_INLINE std::uint32_t bits(const Mask& mask) {
     std::uint32_t out = 0;
-    L3PS_EACH_PART(out |= part_bits(mask.part[i]) << (i * WIDTH))
+    L3PS_EACH_PART(out |= part_bits(mask.part[i]) << (i * WIDTH));
     return out;
 }
 L3PS_INLINE bool any(const Mask& mask) { return bits(mask) != 0; }

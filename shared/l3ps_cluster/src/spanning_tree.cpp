@@ -22,9 +22,18 @@ std::uint32_t root_of(Array<std::uint32_t>& parent, std::uint32_t of) {
 class Boruvka {
 public:
     Boruvka(Tree& tree, Neighbourhood& around, Team& team)
-        : tree_(tree), around_(around), team_(team), component_(tree.places()), parent_(tree.places()),
-          bound_(tree.places()), candidate_(tree.places(), NONE), open_(tree.leaves, 0xFFFF), best_(tree.count),
-          locks_(LOCKS, 0), edges_(tree.count - 1), roots_(tree.count) {
+        : tree_(tree),
+          around_(around),
+          team_(team),
+          component_(tree.places()),
+          parent_(tree.places()),
+          bound_(tree.places()),
+          candidate_(tree.places(), NONE),
+          open_(tree.leaves, 0xFFFF),
+          best_(tree.count),
+          locks_(LOCKS, 0),
+          edges_(tree.count - 1),
+          roots_(tree.count) {
         for (std::uint32_t i = 0; i < tree.places(); ++i) component_[i] = parent_[i] = i;
         for (std::uint32_t i = 0; i < tree.count; ++i) roots_[i] = i;
         std::memcpy(bound_.data(), around.core.data(), tree.places() * sizeof(float));
@@ -39,8 +48,8 @@ public:
 
 private:
     void round() {
-        const Forest forest{view(tree_), around_.core.data(), around_.near.data(), around_.kept, component_.data(),
-                            bound_.data(), candidate_.data(), open_.data(), best_.data(), locks_.data()};
+        const Forest forest{view(tree_),   around_.core.data(), around_.near.data(), around_.kept, component_.data(),
+                            bound_.data(), candidate_.data(),   open_.data(),        best_.data(), locks_.data()};
         for (const std::uint32_t root : roots_) best_[root] = {INFINITE, INFINITE, NONE, NONE};
         const Kernels& kernel = kernels();
         team_.over(tree_.leaves, CHUNK, [&](std::size_t a, std::size_t b) { kernel.propose_known(forest, a, b); });

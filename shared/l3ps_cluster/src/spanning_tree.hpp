@@ -9,8 +9,8 @@ namespace l3ps {
 // Squared distance of each place's point to its min_samples-th nearest other point, and the nearest `kept` of those.
 struct Neighbourhood {
     int kept = 0;
-    Array<float> core;            // [place], infinite after the last point
-    Array<std::uint32_t> near;    // [leaf][kept][lane]
+    Array<float> core;          // [place], infinite after the last point
+    Array<std::uint32_t> near;  // [leaf][kept][lane]
 };
 
 Neighbourhood neighbourhood(const Tree& tree, int min_samples, Team& team);
