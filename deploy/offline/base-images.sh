@@ -4,7 +4,7 @@
 # Needs mmdebstrap. The label l3ps.stand-in tells such an image, and what is built on it, from the official one.
 set -eu
 case $1 in
-    python:3.11-slim-bookworm) suite=bookworm packages=ca-certificates,python3,python3-pip,python3-venv ;;
+    python:3.11-slim-bookworm) suite=bookworm packages=ca-certificates,python3,python3-pip,python3-venv,libpython3-dev ;;
     debian:trixie-slim) suite=trixie packages=ca-certificates ;;
     *) echo "No recipe for $1." >&2; exit 2 ;;
 esac

@@ -24,7 +24,7 @@ from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent, track
 from l3ps.refine.accumulate import estimate_poses, transform
-from l3ps.refine.cluster import Clusterer, cluster_scene, hdbscan_package
+from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.instances import correct_instances, geometric_instances
 from l3ps.refine.vote import fill_unseen_ground, vote
@@ -84,7 +84,7 @@ def refine_scene(
     sensor_height: float | None = None,
     threads: int = 2,
     progress: Progress = silent,
-    clusterer: Clusterer = hdbscan_package,
+    clusterer: Clusterer | None = None,
 ) -> RefinedScene:
     """Repair primal labels by the geometry of the accumulated scene (paper, section III-D).
 
@@ -95,7 +95,7 @@ def refine_scene(
         sensor_height: LiDAR above ground in metres, None where unknown.
         threads: threads of each step.
         progress: told after each scan and step.
-        clusterer: implementation of HDBSCAN.
+        clusterer: implementation of HDBSCAN; None takes that of ``l3ps_cluster``.
 
     Returns:
         The refined labels in point-file order.
@@ -119,7 +119,13 @@ def refine_scene(
 
     with book.span("cluster"):
         cluster = cluster_scene(
-            points, ground, preset.min_cluster_size, threads=threads, voxel=preset.voxel, clusterer=clusterer
+            points,
+            ground,
+            preset.min_cluster_size,
+            threads=threads,
+            voxel=preset.voxel,
+            clusterer=clusterer,
+            cancel=lambda: progress("cluster", 0, 1),
         )
         progress("cluster", 1, 1)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Callable
 
-import hdbscan
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+import l3ps_cluster
 
 NOISE = -1
 NOISE_NEIGHBOURS = 3
@@ -17,12 +19,44 @@ Clusterer = Callable[[NDArray[np.float32], int, int], NDArray[np.int32]]
 """(points (N, 3), min_cluster_size, threads) → (N,) int32 label, -1 for noise."""
 
 
+def exact_hdbscan(
+    points: NDArray[np.float32],
+    min_cluster_size: int,
+    threads: int,
+    cancel: Callable[[], None] | None = None,
+) -> NDArray[np.int32]:
+    """HDBSCAN of ``l3ps_cluster``, as the ``hdbscan`` package defines it; by that package where it was not built.
+
+    Args:
+        points: (N, 3) float32, metres.
+        min_cluster_size: HDBSCAN's s, which is its min_samples too.
+        threads: the result does not depend on it.
+        cancel: asked every 50 ms; stops the work by raising.
+    """
+    if not l3ps_cluster.native:
+        _warn_of_the_slow_way()
+        return hdbscan_package(points, min_cluster_size, threads)
+    return l3ps_cluster.HDBSCAN(min_cluster_size, threads=threads).fit_predict(points, cancel)
+
+
+@functools.cache
+def _warn_of_the_slow_way() -> None:
+    """Once a process, whatever the warning filters say."""
+    warnings.warn(
+        "l3ps-cluster was installed without its C++ part, so the hdbscan package clusters, some 50 times slower. "
+        "Install a C++ compiler, then run `uv sync --reinstall-package l3ps-cluster`.",
+        stacklevel=3,
+    )
+
+
 def hdbscan_package(points: NDArray[np.float32], min_cluster_size: int, threads: int) -> NDArray[np.int32]:
     """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass.
 
     It runs in this thread alone: asked for more jobs, the package starts processes, which a prefork worker's children
     may not.
     """
+    import hdbscan  # noqa: PLC0415  (a second to import, and only needed for comparison)
+
     del threads
     if len(points) <= min_cluster_size:
         return np.full(len(points), NOISE, dtype=np.int32)
@@ -37,7 +71,8 @@ def cluster_scene(
     *,
     threads: int = 2,
     voxel: float | None = None,
-    clusterer: Clusterer = hdbscan_package,
+    clusterer: Clusterer | None = None,
+    cancel: Callable[[], None] | None = None,
 ) -> NDArray[np.int32]:
     """Cluster ground and non-ground points apart from each other.
 
@@ -48,12 +83,15 @@ def cluster_scene(
         threads: threads of the clusterer.
         voxel: edge in metres of the cells whose centroids are clustered in place of the points; None clusters the
             points themselves, as published.
-        clusterer: the implementation.
+        clusterer: the implementation; None takes :func:`exact_hdbscan`.
+        cancel: asked every 50 ms while the default clusterer works; stops it by raising.
 
     Returns:
         (N,) int32 cluster ids from 0, unique over both partitions. Points that are not finite keep -1, as do those of
         a partition in which no cluster was found: nothing groups them.
     """
+    if clusterer is None:
+        clusterer = functools.partial(exact_hdbscan, cancel=cancel)
     labels = np.full(len(points), NOISE, dtype=np.int32)
     first_free = 0
     finite = np.isfinite(points).all(axis=1)
@@ -81,22 +119,7 @@ def reassign_noise(points: NDArray[np.float32], labels: NDArray[np.int32], threa
     Returns:
         (N,) int32 without noise, unless there is no cluster at all.
     """
-    noise = labels == NOISE
-    if not noise.any() or noise.all():
-        return labels
-    clustered = np.flatnonzero(~noise)
-    k = min(NOISE_NEIGHBOURS, len(clustered))
-    _, neighbour = cKDTree(points[clustered]).query(points[noise], k=k, workers=threads)
-    votes = np.sort(labels[clustered][neighbour.reshape(-1, k)], axis=1)
-    out = labels.copy()
-    out[noise] = _row_mode(votes)
-    return out
-
-
-def _row_mode(rows: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Most frequent value of each sorted row; a tie goes to the lowest."""
-    count = (rows[:, :, None] == rows[:, None, :]).sum(axis=2)
-    return np.asarray(rows[np.arange(len(rows)), count.argmax(axis=1)], dtype=np.int32)
+    return l3ps_cluster.fill_noise(points, labels, NOISE_NEIGHBOURS, threads=threads)
 
 
 def _centroids(points: NDArray[np.float32], voxel: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-HEAVY = ("onnxruntime", "kiss_icp", "cv2", "scipy", "hdbscan", "pypatchworkpp", "torch", "sklearn")
+HEAVY = ("onnxruntime", "kiss_icp", "cv2", "scipy", "hdbscan", "l3ps_cluster", "pypatchworkpp", "torch", "sklearn")
 
 
 def test_the_platform_needs_none_of_the_method_s_libraries() -> None:

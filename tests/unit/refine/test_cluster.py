@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from l3ps.refine.cluster import NOISE, cluster_scene, hdbscan_package, reassign_noise
+from l3ps.errors import Cancelled
+from l3ps.refine.cluster import NOISE, cluster_scene, exact_hdbscan, hdbscan_package, reassign_noise
 
 
 def blob(rng, centre, count=60, spread=0.2):
@@ -59,7 +60,30 @@ def test_cells_stand_for_their_points(rng):
     assert not set(labels[:500]) & set(labels[500:])
 
 
-def test_the_package_is_called_with_the_published_parameters(rng):
+@pytest.mark.parametrize("clusterer", [exact_hdbscan, hdbscan_package])
+def test_clustering_has_the_published_parameters(rng, clusterer):
     points = np.concatenate([blob(rng, (i * 10, 0, 0), 4) for i in range(5)])
-    assert len(set(hdbscan_package(points, 3, 1)) - {NOISE}) == 5, "s = 3 finds groups of 4"
-    assert len(set(hdbscan_package(points, 5, 1)) - {NOISE}) < 5, "s = 5 does not"
+    assert len(set(clusterer(points, 3, 1)) - {NOISE}) == 5, "s = 3 finds groups of 4"
+    assert len(set(clusterer(points, 5, 1)) - {NOISE}) < 5, "s = 5 does not"
+
+
+def test_the_core_clusters_unless_another_is_asked_for(rng):
+    points = np.concatenate([blob(rng, centre, spread=2) for centre in ((0, 0, 0), (9, 0, 0), (0, 9, 0))])
+    asked = []
+
+    def one_cluster(part, size, threads):
+        asked.append((len(part), size, threads))
+        return np.zeros(len(part), np.int32)
+
+    ground = points[:, 2] < 0
+    assert (cluster_scene(points, ground, 5) == cluster_scene(points, ground, 5, clusterer=exact_hdbscan)).all()
+    assert (cluster_scene(points, ground, 5, threads=3, clusterer=one_cluster) == ground).all()
+    assert asked == [((~ground).sum(), 5, 3), (ground.sum(), 5, 3)]
+
+
+def test_what_cancel_raises_ends_the_clustering(rng):
+    def cancel():
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        cluster_scene(blob(rng, (0, 0, 0), 400_000), np.zeros(400_000, bool), 5, threads=1, cancel=cancel)
