@@ -28,7 +28,7 @@ from l3ps.refine.accumulate import Odometer, deskew, twist
 from l3ps.refine.overlap import Fit, Standing, fit, search, standing
 
 WORSE, SLACK = 1.1, 0.005
-"""The log's poses are clearly worse when their mean residual exceeds that of KISS-ICP by this factor and this many
+"""The log's poses are clearly worse when their median residual exceeds that of KISS-ICP by this factor and this many
 metres. True poses of simulated drives exceed it by up to 5 %, as registration makes small what is measured here;
 those of a SemanticKITTI sequence by 20 %."""
 LOST = 0.25
@@ -129,7 +129,7 @@ class PoseTracker:
             return self._told("kiss-icp", own, None, [])
         log = _Steps.of(self._steps["log"], self._fits["log"], LOST_LOG)
         both = np.isfinite(own.residual) & np.isfinite(log.residual) & ~own.lost
-        ours, theirs = (float(s.residual[both].mean()) if both.any() else np.nan for s in (own, log))
+        ours, theirs = (float(np.median(s.residual[both])) if both.any() else np.nan for s in (own, log))
         if theirs > WORSE * ours + SLACK:
             what = f"neighbouring scans lie {theirs:.2f} m apart under the log's poses, {ours:.2f} m under KISS-ICP's"
             remedy = "KISS-ICP's were used; check the ego poses and the LiDAR's extrinsic."
