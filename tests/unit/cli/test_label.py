@@ -1,5 +1,6 @@
 """``l3ps label``, ``l3ps bench`` and ``l3ps simulate`` as a user calls them."""
 
+import importlib.util
 import json
 import shutil
 
@@ -114,8 +115,54 @@ def test_bench_tells_every_stage_and_its_peers(small_drive):
     figures = json.loads(result.stdout)
     assert figures["scans"] == 1
     assert set(figures["stages"]) == {"accumulate", "ground", "cluster", "vote", "instances"}
-    assert all(cost["seconds"] >= 0 and cost["peak_mb"] > 10 for cost in figures["stages"].values())
-    assert figures["clustering"]["hdbscan"] > 0
+    for cost in figures["stages"].values():
+        assert cost["seconds"] >= 0 and cost["peak_mb"] > 10
+        assert cost["bytes_a_point"] == pytest.approx(cost["growth_mb"] * 2**20 / figures["points"])
+    assert figures["peak_mb"] == max(cost["peak_mb"] for cost in figures["stages"].values())
+    assert figures["bytes_a_point"] > 12, "the accumulated points alone take so much"
+    assert set(figures["clustering"]) == {"l3ps", "fast_hdbscan", "hdbscan"}
+    assert figures["clustering"]["l3ps"] > 0
+    for name in ("fast_hdbscan", "hdbscan"):
+        seconds, ratio = figures["clustering"][name], figures["ratios"][f"clustering_vs_{name}"]
+        if importlib.util.find_spec(name) is None:
+            assert seconds is None and ratio is None
+        else:
+            assert ratio == pytest.approx(seconds / figures["clustering"]["l3ps"])
+    drive = open_drive(small_drive)
+    sizes = [len(scan.load_points()) for scan in drive.scenes[0].scans]
+    assert [(row["scans"], row["points"]) for row in figures["growth"]] == [(1, sizes[0]), (2, sum(sizes))]
+    first, last = figures["growth"][0], figures["growth"][-1]
+    assert last["us_a_point"] == pytest.approx(1e6 * last["seconds"] / last["points"])
+    assert figures["ratios"]["growth_1_to_max"] == pytest.approx(last["us_a_point"] / first["us_a_point"])
+
+
+def test_bench_leaves_out_what_it_is_told_to(small_drive):
+    result = run("bench", "refine", "--log", small_drive, "--scans", 1, "--no-peers", "--no-growth", "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["growth"] == []
+    assert figures["clustering"]["l3ps"] > 0
+    assert (figures["clustering"]["hdbscan"], figures["clustering"]["fast_hdbscan"]) == (None, None)
+    assert set(figures["ratios"].values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [(("--scene", "x"), "no scene 'x'"), (("--preset", "x"), "no 'x'"), (("--log", "nowhere"), "no such file")],
+)
+def test_bench_refuses_in_one_sentence(small_drive, options, expected):
+    result = run("bench", "refine", "--log", small_drive, "--no-peers", *options)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+    assert "Traceback" not in result.output and "Usage" not in result.output
+
+
+def test_bench_says_which_scan_cannot_be_refined(spoilt_drive):
+    drive, scan = spoilt_drive
+    result = run("bench", "refine", "--log", drive, "--no-peers", "--no-growth")
+    assert result.exit_code == 2
+    assert scan.path.name in result.stderr
+    assert "Traceback" not in result.output
 
 
 def test_simulate_makes_a_drive_and_touches_no_folder_in_use(tmp_path):
