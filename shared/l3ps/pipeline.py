@@ -20,6 +20,7 @@ from l3ps import project
 from l3ps.costs import CostBook, StageCost
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
+from l3ps.evaluate.estimates import ScanEstimate, estimate_scans
 from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent, track
@@ -44,12 +45,14 @@ class RefinedScene:
         labels: refined labels, one a scan, in scan order.
         poses: (S, 4, 4) float64, lidar frame of each scan → frame of the first.
         costs: per stage.
+        estimates: how good each scan's labels are, estimated without truth.
         motion: the poses with their source and how well the scans fit them.
     """
 
     labels: list[ScanLabels]
     poses: NDArray[np.float64]
     costs: dict[str, StageCost]
+    estimates: list[ScanEstimate]
     motion: Motion
 
     @property
@@ -119,23 +122,23 @@ def refine_scene(
     motion, ground = _survey(scene, primal, preset, sensor_height, book, progress)
     chunks = plan([len(mask) for mask in ground], motion.starts, max_points)
     merger = Merger()
+    estimates: list[ScanEstimate] = []
     for index, chunk in enumerate(chunks):
         own = slice(chunk.first, chunk.stop)
-        merger.add(
-            chunk,
-            _refine_chunk(
-                scene.scans[own],
-                primal[own],
-                ground[own],
-                motion.part(chunk.first, chunk.stop),
-                preset,
-                threads,
-                book,
-                progress_of(progress, index, len(chunks)),
-                clusterer,
-            ),
+        labels, judged = _refine_chunk(
+            scene.scans[own],
+            primal[own],
+            ground[own],
+            motion.part(chunk.first, chunk.stop),
+            preset,
+            threads,
+            book,
+            progress_of(progress, index, len(chunks)),
+            clusterer,
         )
-    return RefinedScene(merger.labels, motion.poses, book.stages, motion)
+        merger.add(chunk, labels)
+        estimates += judged[chunk.kept_first - chunk.first : chunk.kept_stop - chunk.first]
+    return RefinedScene(merger.labels, motion.poses, book.stages, estimates, motion)
 
 
 def _survey(
@@ -173,8 +176,8 @@ def _refine_chunk(
     book: CostBook,
     progress: Progress,
     clusterer: Clusterer,
-) -> list[ScanLabels]:
-    """Refined labels of scans that are accumulated in one frame."""
+) -> tuple[list[ScanLabels], list[ScanEstimate]]:
+    """Refined labels of scans that are accumulated in one frame, and how good they seem."""
     bounds = np.cumsum([0, *map(len, grounds)])
 
     with book.span("accumulate"):
@@ -192,7 +195,8 @@ def _refine_chunk(
         progress("cluster", 1, 1)
 
     with book.span("vote"):
-        semantic = vote(cluster, np.concatenate([labels.semantic for labels in primal]), preset.voting)
+        votes = np.concatenate([labels.semantic for labels in primal])
+        semantic = vote(cluster, votes, preset.voting)
         if preset.unseen_ground is not None:
             semantic = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
         progress("vote", 1, 1)
@@ -206,8 +210,10 @@ def _refine_chunk(
             else:
                 ids = geometric_instances(points[part], semantic[part], preset.instance_gap)
             refined.append(ScanLabels(before.token, semantic[part], ids))
+        tokens = [labels.token for labels in primal]
+        estimates = estimate_scans(tokens, bounds, points, cluster, votes, semantic)
 
-    return refined
+    return refined, estimates
 
 
 _REMEDY = "Use the primal labels that were made from this log."

@@ -161,7 +161,7 @@ def test_bench_says_which_scan_cannot_be_refined(spoilt_drive):
     drive, scan = spoilt_drive
     result = run("bench", "refine", "--log", drive, "--no-peers", "--no-growth")
     assert result.exit_code == 2
-    assert scan.path.name in result.stderr
+    assert scan.token in result.stderr
     assert "Traceback" not in result.output
 
 
