@@ -56,6 +56,8 @@ def plan(sizes: Sequence[int], starts: Sequence[int] = (0,), max_points: int | N
     chunks: list[Chunk] = []
     for start, end in pairwise([*starts, len(sizes)]):
         spans = _spans(total, start, end, max_points)
+        if not spans:
+            continue
         middles = [(later[0] + earlier[1] + 1) // 2 for earlier, later in pairwise(spans)]
         kept = pairwise([start, *middles, end])
         chunks += [Chunk(*span, *own) for span, own in zip(spans, kept, strict=True)]

@@ -44,7 +44,12 @@ def test_a_drive_gets_labels_poses_and_a_report(small_drive, bundle, tmp_path):
     assert summary["preset"]["name"] == "paper"
     assert set(summary["quality"]) == {"primal", "refined"}
     assert set(summary["scenes"][0]["stages"]) == {"segment", "accumulate", "ground", "cluster", "vote", "instances"}
-    assert summary["scenes"][0]["points"] == sum(len(scan.load_points()) for scan in scene.scans)
+    told = summary["scenes"][0]
+    assert [row["token"] for row in told["estimates"]] == [scan.token for scan in scene.scans]
+    assert all(0 <= row["estimate"] <= 1 and row["pq"] is not None for row in told["estimates"])
+    assert told["rank_correlation"] is None, "two scans have no ranks worth the name"
+    assert told["poses"]["source"] == "kiss-icp", "as published"
+    assert told["points"] == sum(len(scan.load_points()) for scan in scene.scans)
 
 
 def test_the_same_input_gives_the_same_bytes(small_drive, bundle, tmp_path):
