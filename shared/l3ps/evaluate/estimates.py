@@ -156,7 +156,7 @@ def _consistencies(
     """
     scans = len(bounds) - 1
     step = max(1, -(-len(points) // SAMPLE))
-    scan = np.repeat(np.arange(scans), np.diff(bounds))[::step]
+    scan = np.searchsorted(bounds, np.arange(0, len(points), step), side="right") - 1
     sample, label = points[::step], refined[::step]
     # What is void, or not finite, says nothing and is not asked.
     usable = np.isfinite(sample).all(axis=1) & (label != VOID)

@@ -52,7 +52,7 @@ class Odometer:
         """
         index, odometry = self._scans, self._odometry
         self._scans += 1
-        reach = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+        reach = np.linalg.norm(xyz, axis=1)
         usable = xyz[(reach < odometry.max_range) & (reach > odometry.min_range)]  # neither holds for NaN
         if len(usable) == 0:
             raise ProcessingError(

@@ -89,6 +89,7 @@ class PoseTracker:
         self._last: Standing | None = None
         self._steps: dict[str, list[Matrix]] = {"kiss-icp": [], "log": []}
         self._fits: dict[str, list[Fit]] = {"kiss-icp": [], "log": []}
+        self._poses: list[Matrix] = []
         self._scans = 0
 
     def add(self, points: Points) -> None:
@@ -106,12 +107,12 @@ class PoseTracker:
         here, before = standing(xyz), self._last
         self._last = here
         if before is None:
-            self._odometer(xyz)
+            self._poses.append(self._odometer(xyz))
             return
         log = None if self._log is None else self._log[index - 1]
         if checked:
             self._odometer.predict(_predicted(before, here, self._odometer.step, log))
-        self._odometer(xyz)
+        self._poses.append(self._odometer(xyz))
         step = self._odometer.step
         own = fit(before, here, step)
         self._steps["kiss-icp"].append(step)
@@ -157,11 +158,8 @@ class PoseTracker:
                 starts.append(int(pair) + 1)
                 remedy = f"The scene was refined in parts, cut before this scan. {remedy}"
             problems.append(self._warning("odometry-failed", what, remedy, int(pair) + 1))
-        poses = np.empty((self._scans, 4, 4))
-        pose = np.eye(4)
-        for index in range(self._scans):
-            pose = pose @ steps[index - 1] if index else pose
-            poses[index] = pose
+        published = self._preset.poses == "kiss-icp"  # the product of its steps differs in the last digit
+        poses = np.array(self._poses).reshape(-1, 4, 4) if published else _chained(steps)[: self._scans]
         return Motion(
             poses,
             source,
@@ -250,6 +248,14 @@ def _predicted(before: Standing, here: Standing, last: Matrix, log: Matrix | Non
     if overlaps[best] >= LOST:
         return candidates[best]
     return search(before, here, candidates)
+
+
+def _chained(steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(S, 4, 4) poses in the frame of the first from (S - 1, 4, 4) motions."""
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
 
 
 def _moved(step: Matrix) -> str:
