@@ -152,7 +152,8 @@ class PoseTracker:
                 problems.append(self._warning("pose-jump", what, "The motion that fits was used.", int(pair) + 1))
         starts = [0]
         for pair in np.flatnonzero(lost):
-            what = f"it cannot be registered with the scan before it: {100 * overlap[pair]:.0f} % of what stands met"
+            share = f"{100 * overlap[pair]:.0f} %"
+            what = f"it cannot be laid onto the scan before it: only {share} of what stands there meets something"
             remedy = "Give the log's ego poses, or leave scans of another place out."
             if self._preset.poses == "log":
                 starts.append(int(pair) + 1)
