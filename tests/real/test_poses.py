@@ -1,4 +1,4 @@
-"""Whose poses real recordings are accumulated by; as published they equal those recorded from the published settings."""
+"""Whose poses real recordings are accumulated by; as published they equal those that were recorded."""
 
 from dataclasses import replace
 
