@@ -32,6 +32,7 @@ def refinement(folder: Path, root: str, scene: str, preset: str, threads: int, s
     """
     from l3ps.pipeline import refine_scene
     from l3ps.presets import PRESETS
+    from l3ps.refine import cluster
 
     drive, part, primal = _inputs(root, scene, scans)
     options = {"sensor_height": drive.sensor_height, "threads": threads}
@@ -50,7 +51,7 @@ def refinement(folder: Path, root: str, scene: str, preset: str, threads: int, s
         stages[name]["growth_mb"] = first.peak_mb - before
         stages[name]["bytes_a_point"] = (first.peak_mb - before) * 2**20 / points
     _save_partitions(folder, part, refined.poses, drive.sensor_height)
-    clusterer = (refine_scene.__kwdefaults__ or {})["clusterer"]  # whatever the pipeline takes by itself
+    clusterer = getattr(cluster, "exact_hdbscan", cluster.hdbscan_package)  # what the pipeline takes by itself
     size = PRESETS[preset].min_cluster_size
     return {
         "scans": len(part.scans),
