@@ -90,6 +90,7 @@ class PoseTracker:
         self._steps: dict[str, list[Matrix]] = {"kiss-icp": [], "log": []}
         self._fits: dict[str, list[Fit]] = {"kiss-icp": [], "log": []}
         self._poses: list[Matrix] = []
+        self._moving = False  # whether the last motion tells the next
         self._scans = 0
 
     def add(self, points: Points) -> None:
@@ -111,7 +112,8 @@ class PoseTracker:
             return
         log = None if self._log is None else self._log[index - 1]
         if checked:
-            self._odometer.predict(_predicted(before, here, self._odometer.step, log))
+            last = self._odometer.step if self._moving else None
+            self._odometer.predict(_predicted(before, here, last, log))
         self._poses.append(self._odometer(xyz))
         step = self._odometer.step
         own = fit(before, here, step)
@@ -120,8 +122,10 @@ class PoseTracker:
         if log is not None:
             self._steps["log"].append(log)
             self._fits["log"].append(fit(before, here, log))
-        if checked and own.overlap < LOST:
+        lost = checked and own.overlap < LOST
+        if lost:
             self._odometer.restart(xyz)  # the map behind is of another place than the scan's pose says
+        self._moving = not lost
 
     def motion(self) -> Motion:
         """The motion through the scans added so far."""
@@ -241,14 +245,15 @@ def velocities(scene: Scene, steps: NDArray[np.float64], lost: NDArray[np.bool_]
     return total / np.maximum(count, 1)
 
 
-def _predicted(before: Standing, here: Standing, last: Matrix, log: Matrix | None) -> Matrix:
+def _predicted(before: Standing, here: Standing, last: Matrix | None, log: Matrix | None) -> Matrix:
     """The motion to start the registration from: the best of what is at hand, else of a search."""
-    candidates = [last, *([] if log is None else [log])]
-    overlaps = [np.nan_to_num(fit(before, here, motion).overlap, nan=1.0) for motion in candidates]
-    best = int(np.argmax(overlaps))
-    if overlaps[best] >= LOST:
-        return candidates[best]
-    return search(before, here, candidates)
+    candidates = [motion for motion in (last, log) if motion is not None]
+    if candidates:
+        overlaps = [np.nan_to_num(fit(before, here, motion).overlap, nan=1.0) for motion in candidates]
+        best = int(np.argmax(overlaps))
+        if overlaps[best] >= LOST:
+            return candidates[best]
+    return search(before, here, [*candidates, np.eye(4)])
 
 
 def _chained(steps: NDArray[np.float64]) -> NDArray[np.float64]:
