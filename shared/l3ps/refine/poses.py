@@ -246,13 +246,15 @@ def velocities(scene: Scene, steps: NDArray[np.float64], lost: NDArray[np.bool_]
 
 
 def _predicted(before: Standing, here: Standing, last: Matrix | None, log: Matrix | None) -> Matrix:
-    """The motion to start the registration from: the best of what is at hand, else of a search."""
+    """The motion to start the registration from: the best of what is at hand, or of a search.
+
+    Where no motion is known yet it is searched for even if the log tells one: started from a wrong motion, KISS-ICP
+    stays there and confirms it.
+    """
     candidates = [motion for motion in (last, log) if motion is not None]
-    if candidates:
-        overlaps = [np.nan_to_num(fit(before, here, motion).overlap, nan=1.0) for motion in candidates]
-        best = int(np.argmax(overlaps))
-        if overlaps[best] >= LOST:
-            return candidates[best]
+    overlaps = [np.nan_to_num(fit(before, here, motion).overlap, nan=1.0) for motion in candidates]
+    if last is not None and max(overlaps) >= LOST:
+        return candidates[int(np.argmax(overlaps))]
     return search(before, here, [*candidates, np.eye(4)])
 
 

@@ -52,6 +52,21 @@ def test_a_drive_gets_labels_poses_and_a_report(small_drive, bundle, tmp_path):
     assert told["points"] == sum(len(scan.load_points()) for scan in scene.scans)
 
 
+def test_poses_that_the_scans_contradict_are_told_and_reported(small_drive, bundle, tmp_path):
+    drive, report = tmp_path / "drive", tmp_path / "run.json"
+    shutil.copytree(small_drive, drive)
+    (table,) = drive.glob("v1.0-*/ego_pose.json")
+    rows = json.loads(table.read_text())
+    table.write_text(json.dumps([row | {"translation": [0, 0, 0]} for row in rows]))
+    result = run("label", drive, "--model", bundle, "--out", tmp_path / "o", "--report", report)
+    assert result.exit_code == 0, result.output
+    assert "under the log's poses" in result.stderr
+    (told,) = json.loads(report.read_text())["scenes"]
+    assert [problem["code"] for problem in told["warnings"]] == ["inconsistent-poses"]
+    assert (told["poses"]["source"], told["poses"]["parts"]) == ("kiss-icp", 1)
+    assert told["poses"]["residual"] < 0.5
+
+
 def test_the_same_input_gives_the_same_bytes(small_drive, bundle, tmp_path):
     for name in ("a", "b"):
         assert run("label", small_drive, "--model", bundle, "--out", tmp_path / name).exit_code == 0
