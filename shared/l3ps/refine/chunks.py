@@ -107,18 +107,22 @@ class Merger:
         self._before = chunk, named
 
     def _numbers(self, known: Sequence[ScanLabels], labels: Sequence[ScanLabels]) -> NDArray[np.int32]:
-        """(M + 1,) int32: for each id of a chunk the id in the scene."""
+        """(M + 1,) int32: for each id of a chunk the id in the scene; what is new is counted on from the last."""
         largest = max((int(scan.instance.max(initial=0)) for scan in labels), default=0)
-        number = np.arange(largest + 1, dtype=np.int32) + self._taken
-        number[0] = 0
-        shared = shared_points(known, labels)
+        number = np.arange(largest + 1, dtype=np.int32)
+        if self._before is None:
+            return number
+        is_new = np.zeros(largest + 1, dtype=bool)
+        for scan in labels:
+            is_new[scan.instance] = True
+        is_new[0] = False
         used: set[int] = set()
-        found = np.zeros(largest + 1, dtype=bool)
-        for old, new, points, smaller in shared:
-            if points >= SHARED * smaller and old not in used and not found[new]:
+        for old, new, points, smaller in shared_points(known, labels):
+            if points >= SHARED * smaller and old not in used and is_new[new]:
                 number[new] = old
                 used.add(old)
-                found[new] = True
+                is_new[new] = False
+        number[is_new] = self._taken + 1 + np.arange(is_new.sum())
         return number
 
 
