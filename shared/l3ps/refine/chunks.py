@@ -109,9 +109,9 @@ class Merger:
     def _numbers(self, known: Sequence[ScanLabels], labels: Sequence[ScanLabels]) -> NDArray[np.int32]:
         """(M + 1,) int32: for each id of a chunk the id in the scene; what is new is counted on from the last."""
         largest = max((int(scan.instance.max(initial=0)) for scan in labels), default=0)
-        number = np.arange(largest + 1, dtype=np.int32)
         if self._before is None:
-            return number
+            return np.arange(largest + 1, dtype=np.int32)
+        number = np.zeros(largest + 1, dtype=np.int32)
         is_new = np.zeros(largest + 1, dtype=bool)
         for scan in labels:
             is_new[scan.instance] = True
