@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from l3ps.evaluate import estimate_scans, rank_correlation
+from l3ps.evaluate import estimate_scans, rank_correlation, seen_twice
 
 CAR, ROAD, MANMADE = 4, 11, 15
 SCANS, SIZE = 6, 3000
@@ -97,9 +97,24 @@ def test_agreement_of_cameras_counts_only_points_that_two_saw(rng):
     agree = np.full(SCANS * SIZE, -1, np.int8)
     agree[:100] = 1
     agree[100:200] = 0
-    estimates = estimate_scans(*inputs, agree)
+    cameras = np.where(agree >= 0, 2, 1).astype(np.uint8)
+    estimates = estimate_scans(*inputs, seen_twice(cameras, agree != 0))
     assert estimates[0].cameras == 0.5
     assert estimates[1].cameras is None
+
+
+def test_what_the_labels_say_of_themselves_counts_a_class_each(rng):
+    """Cars are a third of the points and half of the figure."""
+    tokens, bounds, points, cluster, primal, refined = scene(rng)
+    certain = np.full(SCANS * SIZE, 255, np.uint8)
+    doubtful = certain.copy()
+    doubtful[: bounds[1]][refined[: bounds[1]] == CAR] = 51
+    sure = estimate_scans(tokens, bounds, points, cluster, primal, refined, confidence=certain)
+    unsure = estimate_scans(tokens, bounds, points, cluster, primal, refined, confidence=doubtful)
+    assert sure[0].confidence == 1
+    assert unsure[0].confidence == pytest.approx((0.2 + 1) / 2)
+    assert unsure[0].estimate < sure[0].estimate
+    assert unsure[1] == sure[1]
 
 
 def test_scans_without_points_labels_or_clusters_are_unknown():
