@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format setup setup-dev servers compose-check demo-model clean
+.PHONY: help demo test bench lint format setup setup-dev servers compose-check demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,6 +39,11 @@ setup-dev: $(UV)
 $(CURDIR)/.tools/bin/uv:
 	$(PYTHON) -m venv $(CURDIR)/.tools
 	$(CURDIR)/.tools/bin/pip install --quiet 'uv>=0.9'
+
+bench: $(UV) ## measure refinement and its peers on LOG=log; SCANS=12 takes the first of them
+	@test -n "$(LOG)" || { echo 'Name a drive log: make bench LOG=path' >&2; exit 2; }
+	$(UV) sync --frozen --inexact --all-packages --group bench
+	$(RUN) l3ps bench refine --log "$(LOG)" $(if $(SCANS),--scans $(SCANS))
 
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py

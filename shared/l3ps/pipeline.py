@@ -20,13 +20,16 @@ from l3ps import project
 from l3ps.costs import CostBook, StageCost
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
+from l3ps.evaluate.estimates import ScanEstimate, estimate_scans
 from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent, track
-from l3ps.refine.accumulate import estimate_poses, transform
 from l3ps.refine.cluster import Clusterer, cluster_scene
+from l3ps.refine.accumulate import deskew, transform
+from l3ps.refine.chunks import Merger, plan, progress_of
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.instances import correct_instances, geometric_instances
+from l3ps.refine.poses import Motion, PoseTracker
 from l3ps.refine.vote import fill_unseen_ground, vote
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
@@ -42,11 +45,20 @@ class RefinedScene:
         labels: refined labels, one a scan, in scan order.
         poses: (S, 4, 4) float64, lidar frame of each scan → frame of the first.
         costs: per stage.
+        estimates: how good each scan's labels are, estimated without truth.
+        motion: the poses with their source and how well the scans fit them.
     """
 
     labels: list[ScanLabels]
     poses: NDArray[np.float64]
     costs: dict[str, StageCost]
+    estimates: list[ScanEstimate]
+    motion: Motion
+
+    @property
+    def warnings(self) -> tuple[Problem, ...]:
+        """What the user should know of the scene; nothing of it stopped the work."""
+        return self.motion.problems
 
 
 def primal_labels(scene: Scene, segmenter: Segmenter, progress: Progress = silent) -> list[ScanLabels]:
@@ -85,17 +97,19 @@ def refine_scene(
     threads: int = 2,
     progress: Progress = silent,
     clusterer: Clusterer | None = None,
+    max_points: int | None = None,
 ) -> RefinedScene:
     """Repair primal labels by the geometry of the accumulated scene (paper, section III-D).
 
     Args:
-        scene: the scene.
+        scene: the scene; a scan's points are read when they are needed, twice in all, and let go.
         primal: its primal labels in scan order.
         preset: the parameters.
         sensor_height: LiDAR above ground in metres, None where unknown.
         threads: threads of each step.
         progress: told after each scan and step.
         clusterer: implementation of HDBSCAN; None takes that of ``l3ps_cluster``.
+        max_points: a scene of more points is refined in overlapping chunks of at most so many; None sets no limit.
 
     Returns:
         The refined labels in point-file order.
@@ -105,17 +119,74 @@ def refine_scene(
         ProcessingError: when the odometry fails.
     """
     book = CostBook()
+    motion, ground = _survey(scene, primal, preset, sensor_height, book, progress)
+    chunks = plan([len(mask) for mask in ground], motion.starts, max_points)
+    merger = Merger()
+    estimates: list[ScanEstimate] = []
+    for index, chunk in enumerate(chunks):
+        own = slice(chunk.first, chunk.stop)
+        labels, judged = _refine_chunk(
+            scene.scans[own],
+            primal[own],
+            ground[own],
+            motion.part(chunk.first, chunk.stop),
+            preset,
+            threads,
+            book,
+            progress_of(progress, index, len(chunks)),
+            clusterer,
+        )
+        merger.add(chunk, labels)
+        estimates += judged[chunk.kept_first - chunk.first : chunk.kept_stop - chunk.first]
+    return RefinedScene(merger.labels, motion.poses, book.stages, estimates, motion)
+
+
+def _survey(
+    scene: Scene,
+    primal: Sequence[ScanLabels],
+    preset: Preset,
+    sensor_height: float | None,
+    book: CostBook,
+    progress: Progress,
+) -> tuple[Motion, list[NDArray[np.bool_]]]:
+    """What takes a scene's scans in order and one at a time: their poses and, a scan, (N,) bool which are ground."""
+    _check_tokens(scene.scans, primal)
+    tracker = PoseTracker(scene, preset)
+    split = GroundSegmenter(sensor_height)
+    ground: list[NDArray[np.bool_]] = []
+    for done, (scan, labels) in enumerate(zip(scene.scans, primal, strict=True), start=1):
+        with book.span("accumulate"):
+            cloud = scan.load_points()
+            _check_length(len(cloud), labels)
+            tracker.add(cloud)
+        progress("accumulate", done, len(scene.scans))
+        with book.span("ground"):
+            ground.append(split(cloud.xyz, cloud.intensity))
+        progress("ground", done, len(scene.scans))
+    return tracker.motion(), ground
+
+
+def _refine_chunk(
+    scans: Sequence[Scan],
+    primal: Sequence[ScanLabels],
+    grounds: Sequence[NDArray[np.bool_]],
+    motion: Motion,
+    preset: Preset,
+    threads: int,
+    book: CostBook,
+    progress: Progress,
+    clusterer: Clusterer | None,
+) -> tuple[list[ScanLabels], list[ScanEstimate]]:
+    """Refined labels of scans that are accumulated in one frame, and how good they seem."""
+    bounds = np.cumsum([0, *map(len, grounds)])
 
     with book.span("accumulate"):
-        clouds = [scan.load_points() for scan in scene.scans]
-        _check_match(scene.scans, [len(cloud) for cloud in clouds], primal)
-        ticked = track(clouds, "accumulate", progress)
-        poses = estimate_poses((cloud.xyz for cloud in ticked), preset.odometry)
-        points = np.concatenate([transform(c.xyz, pose) for c, pose in zip(clouds, poses, strict=True)])
-
-    with book.span("ground"):
-        split = GroundSegmenter(sensor_height)
-        ground = np.concatenate([split(c.xyz, c.intensity) for c in track(clouds, "ground", progress)])
+        points = np.empty((bounds[-1], 3), dtype=np.float32)
+        for index, scan in enumerate(scans):
+            cloud = scan.load_points()
+            xyz = deskew(cloud.xyz, cloud.time, motion.velocity[index]) if preset.deskew else cloud.xyz
+            points[bounds[index] : bounds[index + 1]] = transform(xyz, motion.poses[index])
+        ground = np.concatenate(grounds)
 
     with book.span("cluster"):
         cluster = cluster_scene(
@@ -130,13 +201,13 @@ def refine_scene(
         progress("cluster", 1, 1)
 
     with book.span("vote"):
-        semantic = vote(cluster, np.concatenate([labels.semantic for labels in primal]), preset.voting)
+        votes = np.concatenate([labels.semantic for labels in primal])
+        semantic = vote(cluster, votes, preset.voting)
         if preset.unseen_ground is not None:
             semantic = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
         progress("vote", 1, 1)
 
     with book.span("instances"):
-        bounds = np.cumsum([0, *(len(cloud) for cloud in clouds)])
         refined: list[ScanLabels] = []
         for index, before in enumerate(track(primal, "instances", progress)):
             part = slice(bounds[index], bounds[index + 1])
@@ -145,15 +216,21 @@ def refine_scene(
             else:
                 ids = geometric_instances(points[part], semantic[part], preset.instance_gap)
             refined.append(ScanLabels(before.token, semantic[part], ids))
+        tokens = [labels.token for labels in primal]
+        estimates = estimate_scans(tokens, bounds, points, cluster, votes, semantic)
 
-    return RefinedScene(refined, poses, book.stages)
+    return refined, estimates
 
 
-def _check_match(scans: Sequence[Scan], sizes: Sequence[int], primal: Sequence[ScanLabels]) -> None:
-    remedy = "Use the primal labels that were made from this log."
+_REMEDY = "Use the primal labels that were made from this log."
+
+
+def _check_tokens(scans: Sequence[Scan], primal: Sequence[ScanLabels]) -> None:
     if [scan.token for scan in scans] != [labels.token for labels in primal]:
-        raise LabelError(Problem("labels-of-other-scans", "primal labels", "they name other scans", remedy))
-    for size, labels in zip(sizes, primal, strict=True):
-        if len(labels.semantic) != size:
-            what = f"{len(labels.semantic)} labels for {size} points"
-            raise LabelError(Problem("labels-of-other-length", labels.token, what, remedy))
+        raise LabelError(Problem("labels-of-other-scans", "primal labels", "they name other scans", _REMEDY))
+
+
+def _check_length(points: int, labels: ScanLabels) -> None:
+    if len(labels.semantic) != points:
+        what = f"{len(labels.semantic)} labels for {points} points"
+        raise LabelError(Problem("labels-of-other-length", labels.token, what, _REMEDY))

@@ -105,6 +105,10 @@ class Settings(BaseSettings):
     threads: int = 2  # of numeric libraries, per worker process
     concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
 
+    # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping
+    # chunks. At 300 bytes a point (l3ps.refine.chunks) this holds 28 million points, 600 keyframes of nuScenes.
+    refine_bytes: int = Field(default=8 * GiB, gt=0)
+
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     log_format: Literal["json", "console"] = "json"

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import time
-from collections.abc import Callable
-from dataclasses import asdict
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.table import Table
 
 from l3ps.drivelog import opened
-from l3ps.drivelog.types import Drive, Points, Scan, Scene
-from l3ps.labels import ScanLabels
-from l3ps.pipeline import refine_scene
+from l3ps.drivelog.types import Drive, Scene
+from l3ps.errors import DriveLogError, Problem, ProcessingError
 from l3ps.presets import DEFAULT_PRESET, PRESETS
-from l3ps.refine.accumulate import transform
-from l3ps.refine.cluster import hdbscan_package
-from l3ps.refine.ground import GroundSegmenter
-from l3ps.taxonomy import NUSCENES16
-from l3ps_cli.errors import BAD_INPUT, clear_errors, fail, out
-from l3ps_cli.progress import bars
+from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
 
 app = typer.Typer(help="Measure on your own logs.", no_args_is_help=True)
+
+PEERS = ("fast_hdbscan", "hdbscan")
+GROWTH = (1, 2, 4, 8, 16)
+"""Scans of the sizes that are measured one after the other."""
 
 
 @app.callback()
@@ -42,99 +38,117 @@ def refine(
     scene: Annotated[str | None, typer.Option(help="This scene in place of the first.")] = None,
     preset: Annotated[str, typer.Option(help=f"{', '.join(PRESETS)}.")] = DEFAULT_PRESET,
     threads: Annotated[int, typer.Option(min=1)] = 2,
+    growth: Annotated[bool, typer.Option(help="Also 1, 2, 4, 8, 16 scans, as far as the scene has them.")] = True,
+    peers: Annotated[bool, typer.Option(help="Also other packages' clustering; takes minutes.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Seconds and peak memory of each refinement stage on the first scene of a log.
+    """Seconds and memory of each refinement stage on the first scene of a log, and how they grow with its scans.
 
-    No model is needed: the log's truth stands for the primal labels, or where it has none, labels by height.
+    No model is needed: the log's truth stands for the primal labels, or where it has none, labels by height. Each
+    measurement is made in a process of its own; own times are the median of three runs, those of other packages are
+    of one, after a small one that lets them compile.
     """
     with clear_errors():
         if preset not in PRESETS:
             fail(f"--preset: there is no '{preset}'. Use one of {', '.join(PRESETS)}.", BAD_INPUT)
-        figures = _figures(log, scans, scene, preset, threads)
+        with opened(log) as drive, tempfile.TemporaryDirectory(prefix="l3ps-bench-") as folder:
+            chosen = _chosen(drive, scene)
+            figures = _figures(drive, chosen, scans, preset, threads, Path(folder), growth=growth, peers=peers)
+    figures = {"log": log.name, **figures}
     if as_json:
         typer.echo(json.dumps(figures))
     else:
         _show(figures)
 
 
-def _figures(log: Path, scans: int | None, scene: str | None, preset: str, threads: int) -> dict[str, Any]:
-    with opened(log) as drive:
-        chosen = next((s for s in drive.scenes if scene in (None, s.name)), None)
-        if chosen is None:
-            raise typer.BadParameter(f"the log has no scene '{scene}'", param_hint="--scene")
-        part = Scene(chosen.name, chosen.scans[:scans])
-        clouds = [scan.load_points() for scan in part.scans]
-        primal = [_stand_in(drive, scan, cloud) for scan, cloud in zip(part.scans, clouds, strict=True)]
-        with bars() as progress:
-            refined = refine_scene(
-                part, primal, PRESETS[preset], sensor_height=drive.sensor_height, threads=threads, progress=progress
-            )
-        return {
-            "log": log.name,
-            "scene": part.name,
-            "scans": len(part.scans),
-            "points": sum(map(len, clouds)),
-            "preset": preset,
-            "threads": threads,
-            "stages": {name: asdict(cost) for name, cost in refined.costs.items()},
-            "seconds": sum(cost.seconds for cost in refined.costs.values()),
-            "peak_mb": max(cost.peak_mb for cost in refined.costs.values()),
-            "clustering": _peers(clouds, refined.poses, drive.sensor_height, PRESETS[preset].min_cluster_size, threads),
-        }
+def _chosen(drive: Drive, name: str | None) -> Scene:
+    for scene in drive.scenes:
+        if name in (None, scene.name) and scene.scans:
+            return scene
+    known = ", ".join(scene.name for scene in drive.scenes[:10])
+    what = "the log has no scene with scans" if name is None else f"the log has no scene '{name}' with scans"
+    raise DriveLogError(Problem("unknown-scene", "--scene", what, f"Its scenes are: {known}."))
 
 
-def _peers(
-    clouds: list[Points], poses: NDArray[np.float64], sensor_height: float | None, size: int, threads: int
+def _figures(
+    drive: Drive,
+    scene: Scene,
+    scans: int | None,
+    preset: str,
+    threads: int,
+    folder: Path,
+    *,
+    growth: bool,
+    peers: bool,
+) -> dict[str, Any]:
+    total = len(scene.scans)
+    taken = min(scans or total, total)
+    common = {"root": str(drive.root), "scene": scene.name, "preset": preset, "threads": threads}
+    own = _child("refinement", f"Refining {taken} scans three times", folder, {**common, "scans": taken})
+    seconds: dict[str, float | None] = {"l3ps": own.pop("clustering"), **dict.fromkeys(PEERS)}
+    rows: list[dict[str, float]] = []
+    if growth:
+        sizes = [size for size in GROWTH if size <= total]
+        what = f"Refining {', '.join(map(str, sizes))} scans, three times each"
+        rows = _child("growth", what, folder, {**common, "sizes": sizes})["growth"]
+    size = PRESETS[preset].min_cluster_size
+    for name in PEERS if peers else ():
+        if importlib.util.find_spec(name) is not None:
+            what = f"Clustering the same {own['points']:,} points with {name}: takes minutes for a million"
+            seconds[name] = _child(name, what, folder, {"size": size, "threads": threads})["seconds"]
+    figures = {"scene": scene.name, "preset": preset, "threads": threads, **own, "clustering": seconds, "growth": rows}
+    return figures | {"ratios": _ratios(seconds, figures["seconds"], rows)}
+
+
+def _ratios(
+    clustering: dict[str, float | None], refinement: float, growth: list[dict[str, float]]
 ) -> dict[str, float | None]:
-    """Seconds that each installed package takes to cluster both partitions; None where it is not installed."""
-    split = GroundSegmenter(sensor_height)
-    ground = np.concatenate([split(cloud.xyz, cloud.intensity) for cloud in clouds])
-    points = np.concatenate([transform(cloud.xyz, pose) for cloud, pose in zip(clouds, poses, strict=True)])
-    partitions = [points[~ground], points[ground]]
-    packages: dict[str, Callable[[NDArray[np.float32]], object] | None] = {
-        "hdbscan": lambda part: hdbscan_package(part, size, threads),
-        "fast_hdbscan": None,
+    """How many times faster than each peer, and how the cost of a point grows; None where it was not measured."""
+    own, fast, plain = clustering["l3ps"], clustering["fast_hdbscan"], clustering["hdbscan"]
+    return {
+        "clustering_vs_fast_hdbscan": fast / own if own and fast else None,
+        "clustering_vs_hdbscan": plain / own if own and plain else None,
+        "refine_vs_fast_hdbscan_clustering": fast / refinement if fast else None,
+        "growth_1_to_max": growth[-1]["us_a_point"] / growth[0]["us_a_point"] if growth else None,
     }
-    if importlib.util.find_spec("fast_hdbscan"):
-        from fast_hdbscan import HDBSCAN
-
-        HDBSCAN(min_cluster_size=size).fit(partitions[0][:1000])  # its first call compiles for a minute
-        packages["fast_hdbscan"] = lambda part: HDBSCAN(min_cluster_size=size).fit(part)
-    seconds: dict[str, float | None] = {}
-    for name, cluster in packages.items():
-        if cluster is None:
-            seconds[name] = None
-            continue
-        began = time.perf_counter()
-        for part in partitions:
-            cluster(part)
-        seconds[name] = time.perf_counter() - began
-    return seconds
 
 
-def _stand_in(drive: Drive, scan: Scan, cloud: Points) -> ScanLabels:
-    """Labels that cost about what real ones do: the truth, or road, cars and buildings by height."""
-    if scan.load_truth is not None and drive.truth_space == NUSCENES16.name:
-        truth = scan.load_truth()
-        return ScanLabels(scan.token, truth.semantic, truth.instance)
-    z = cloud.xyz[:, 2]
-    semantic = np.full(len(z), NUSCENES16.index("manmade"), dtype=np.uint8)
-    semantic[z < 0] = NUSCENES16.index("car")
-    semantic[z < -1.4] = NUSCENES16.index("driveable_surface")
-    return ScanLabels(scan.token, semantic, (semantic == NUSCENES16.index("car")).astype(np.int32))
+def _child(task: str, what: str, folder: Path, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Run a task of :mod:`l3ps_cli.bench_tasks` in a fresh process, whose memory nothing else has touched."""
+    err.print(f"{what} …", highlight=False, soft_wrap=True)
+    (folder / "arguments.json").write_text(json.dumps(arguments))
+    done = subprocess.run(
+        [sys.executable, "-m", "l3ps_cli.bench_tasks", task, str(folder)], stdout=subprocess.DEVNULL, check=False
+    )
+    answer = folder / f"{task}.json"
+    if done.returncode != 0 or not answer.is_file():
+        raise ProcessingError(f"the measurement '{task}' ended with code {done.returncode}; is there memory enough?")
+    result: dict[str, Any] = json.loads(answer.read_text())
+    if "problems" in result:
+        raise DriveLogError(Problem(**problem) for problem in result["problems"])
+    if "error" in result:
+        raise ProcessingError(result["error"])
+    return result
 
 
 def _show(figures: dict[str, Any]) -> None:
     title = f"Refinement of {figures['points']:,} points, {figures['scans']} scans, preset {figures['preset']}"
     table = Table("stage", title=title, title_justify="left")
-    for column in ("seconds", "CPU s", "peak MB"):
+    for column in ("seconds", "CPU s", "peak MB", "bytes a point"):
         table.add_column(column, justify="right")
     for name, cost in figures["stages"].items():
-        table.add_row(name, f"{cost['seconds']:.2f}", f"{cost['cpu_seconds']:.2f}", f"{cost['peak_mb']:.0f}")
+        times = (f"{cost['seconds']:.2f}", f"{cost['cpu_seconds']:.2f}")
+        table.add_row(name, *times, f"{cost['peak_mb']:.0f}", f"{cost['bytes_a_point']:.0f}")
     table.add_section()
-    table.add_row("all", f"{figures['seconds']:.2f}", "", f"{figures['peak_mb']:.0f}", style="bold")
+    whole = (f"{figures['seconds']:.2f}", "", f"{figures['peak_mb']:.0f}", f"{figures['bytes_a_point']:.0f}")
+    table.add_row("all", *whole, style="bold")
     out.print(table)
+    for row in figures["growth"]:
+        line = f"{row['scans']:>3} scans: {row['points']:>10,} points, {row['seconds']:6.2f} s"
+        out.print(f"{line}, {row['us_a_point']:.2f} µs a point", highlight=False)
     for name, seconds in figures["clustering"].items():
-        took = "not installed" if seconds is None else f"{seconds:.2f} s"
+        took = "not measured" if seconds is None else f"{seconds:.2f} s"
         out.print(f"clustering both partitions with {name}: {took}", highlight=False)
+    for name, ratio in figures["ratios"].items():
+        if ratio is not None:
+            out.print(f"{name.replace('_', ' ')}: {ratio:.2f}", highlight=False)

@@ -20,10 +20,11 @@ from l3ps.costs import CostBook
 from l3ps.drivelog import opened, validate, without_bad_scans
 from l3ps.drivelog.types import Drive, Scene
 from l3ps.errors import DriveLogError, InputError, Problem
-from l3ps.evaluate import PROTOCOLS, PanopticEvaluator, evaluate_scene
+from l3ps.evaluate import PROTOCOLS, PanopticEvaluator, evaluate_scene, rank_correlation
 from l3ps.labels import FORMATS, LabelFormat, ScanLabels, write_poses, write_scene
-from l3ps.pipeline import primal_labels, refine_scene
+from l3ps.pipeline import RefinedScene, primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
+from l3ps.refine.poses import Motion
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
 from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out, stopped_by_sigterm
@@ -32,6 +33,7 @@ from l3ps_cli.report import quality_table
 
 T = TypeVar("T")
 LABEL_SUFFIXES = ("_panoptic.npz", "_lidarseg.bin", ".label")
+SHOWN_WARNINGS = 5
 PARTS = ("primal", "refined", "poses.txt", "scans.txt")
 
 
@@ -112,6 +114,7 @@ def _label_scene(
         refined = refine_scene(
             scene, primal, preset, sensor_height=drive.sensor_height, threads=threads, progress=progress
         )
+    _warn(refined.warnings)
     sides: dict[str, Sequence[ScanLabels]] = {"primal": primal, "refined": refined.labels}
     for side, labels in sides.items():
         write_scene(target / side, label_format, scene, labels)
@@ -125,8 +128,43 @@ def _label_scene(
             "scans": len(scene.scans),
             "points": sum(len(labels.semantic) for labels in primal),
             "stages": {stage: asdict(cost) for stage, cost in costs.items()},
+            "poses": _poses(refined.motion),
+            "warnings": [problem.as_dict() for problem in refined.warnings],
+            **_estimates(drive, scene, refined, protocol or drive.truth_space),
         }
     )
+
+
+def _poses(motion: Motion) -> dict[str, Any]:
+    """Whose poses, and how far neighbouring scans lie apart under them in metres; None where nothing tells."""
+    known = motion.residual[np.isfinite(motion.residual)]
+    return {
+        "source": motion.source,
+        "parts": len(motion.starts),
+        "residual": float(known.mean()) if len(known) else None,
+    }
+
+
+def _estimates(drive: Drive, scene: Scene, refined: RefinedScene, protocol: str) -> dict[str, Any]:
+    """Each scan's estimated quality, beside its true PQ and their rank correlation where there is truth."""
+    rows = [estimate.as_dict() for estimate in refined.estimates]
+    truths: list[float | None] = []
+    for scan, labels, row in zip(scene.scans, refined.labels, rows, strict=True):
+        pq = None
+        if scan.load_truth is not None:
+            pq = evaluate_scene(drive, replace(scene, scans=(scan,)), [labels], protocol).quality().pq
+            row["pq"] = pq
+        truths.append(pq)
+    correlation = rank_correlation([estimate.estimate for estimate in refined.estimates], truths)
+    return {"estimates": rows, "rank_correlation": correlation}
+
+
+def _warn(problems: Sequence[Problem]) -> None:
+    """The first few warnings; the report has all."""
+    for problem in problems[:SHOWN_WARNINGS]:
+        err.print(f"Warning: {problem}", style="yellow", markup=False, highlight=False)
+    if len(problems) > SHOWN_WARNINGS:
+        err.print(f"… and {len(problems) - SHOWN_WARNINGS} more warnings.", style="yellow")
 
 
 def _limited(drive: Drive, scene: str | None) -> Drive:

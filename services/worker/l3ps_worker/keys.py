@@ -33,10 +33,14 @@ def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset
     )
 
 
-def refine_key(primal_key: str, preset: Preset, formats: list[str], protocol: str) -> str:
-    """Key prefix of a scene's refined labels and label files."""
+def refine_key(
+    primal_key: str, preset: Preset, formats: list[str], protocol: str, max_points: int | None = None
+) -> str:
+    """Key prefix of a scene's refined labels and label files; ``max_points`` where it is refined in chunks."""
+    chunks = {} if max_points is None else {"max_points": max_points}
     return _key(
         "refine",
+        **chunks,
         primal=primal_key,
         preset=preset.as_dict(),
         formats=sorted(formats),

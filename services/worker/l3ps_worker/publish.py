@@ -29,13 +29,15 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     finished = [(scene, refined[scene.id]) for scene in scenes if scene.id in refined]
     files: list[Json] = []
     joined = dict.fromkeys(JOINED, b"")
-    for done, (_, stage) in enumerate(finished, start=1):
+    judged: dict[str, Json] = {}
+    for done, (scene, stage) in enumerate(finished, start=1):
         scene_manifest = json.loads(context.store.get_bytes(stage.output_key or ""))
         for file in scene_manifest["files"]:
             if file["path"] in joined:
                 joined[file["path"]] += context.store.get_bytes(file["key"])
             else:
                 files.append(file)
+        judged[scene.name] = {key: scene_manifest.get(key, []) for key in ("estimates", "warnings")}
         progress("publish", done, len(finished))
     for path, data in joined.items():
         key = f"{prefix}/{path}"
@@ -48,7 +50,10 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
         "drive_id": job.drive_id,
         "model": model.name,
         "settings": job.settings,
-        "scenes": [{"name": s.name, "state": s.state.value, "scans": s.scans, "points": s.points} for s in scenes],
+        "scenes": [
+            {"name": s.name, "state": s.state.value, "scans": s.scans, "points": s.points, **judged.get(s.name, {})}
+            for s in scenes
+        ],
         "quality": quality,
         "files": files,
     }

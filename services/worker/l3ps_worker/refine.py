@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 
 from l3ps.costs import CostBook
@@ -18,6 +19,7 @@ from l3ps.evaluate import evaluate_scene
 from l3ps.labels import ScanLabels, write_poses, write_scene
 from l3ps.pipeline import REFINE_STAGES, refine_scene
 from l3ps.progress import Progress
+from l3ps.refine.chunks import BYTES_A_POINT
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Json
 from l3ps_platform.errors import ObjectMissing
@@ -28,6 +30,8 @@ from l3ps_worker.keys import refine_key
 from l3ps_worker.segment import primal_key
 from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work
 
+log = structlog.get_logger(__name__)
+
 STEPS = (*REFINE_STAGES, "write", "evaluate", "store")
 SCENE_MANIFEST = "scene.json"
 
@@ -35,7 +39,10 @@ SCENE_MANIFEST = "scene.json"
 def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     """Refine, write, evaluate and store one scene; its ``scene.json`` is stored last and names all the rest."""
     work = scene_work(context, claim)
-    prefix = refine_key(primal_key(work), work.preset, work.job.settings["formats"], work.job.settings["protocol"])
+    budget = max(1, context.settings.refine_bytes // BYTES_A_POINT)
+    max_points = budget if work.scene.points > budget else None
+    wanted = work.job.settings
+    prefix = refine_key(primal_key(work), work.preset, wanted["formats"], wanted["protocol"], max_points)
     manifest_key = f"{prefix}/{SCENE_MANIFEST}"
     try:
         stored: Json = json.loads(context.store.get_bytes(manifest_key))
@@ -52,16 +59,25 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
             sensor_height=drive.sensor_height,
             threads=context.settings.threads,
             progress=progress,
+            max_points=max_points,
         )
         sides = {"primal": primal, "refined": refined.labels}
         out = folder / "out"
         with book.span("write"):
-            files = _write(out, work.job.settings["formats"], scene, sides, refined.poses, progress)
+            files = _write(out, wanted["formats"], scene, sides, refined.poses, progress)
         with book.span("evaluate"):
-            quality = _evaluate(drive, scene, sides, work.job.settings["protocol"], progress)
+            quality = _evaluate(drive, scene, sides, wanted["protocol"], progress)
         with book.span("store"):
             entries = _store(context, prefix, out, files, progress)
-    manifest = {"scene": work.scene.name, "files": entries, "quality": quality}
+    for problem in refined.warnings:
+        log.warning("scene doubtful", scene=work.scene.name, problem=str(problem))
+    manifest = {
+        "scene": work.scene.name,
+        "files": entries,
+        "quality": quality,
+        "estimates": [estimate.as_dict() for estimate in refined.estimates],
+        "warnings": [problem.as_dict() for problem in refined.warnings],
+    }
     context.store.put_bytes(manifest_key, json.dumps(manifest, indent=1).encode())
     costs = {**refined.costs, **book.stages}
     steps = {name: (cost.seconds, cost.peak_mb) for name, cost in costs.items()}

@@ -56,6 +56,10 @@ def test_the_whole_way(direct, drive_zip: Path, fast_model: Path, log: Path, tmp
     assert list(poses) == [scan.token for scene in opened.scenes for scan in scene.scans]
     assert all(np.allclose(poses[scene.scans[0].token], np.eye(4)) for scene in opened.scenes)
     assert (files / "refined" / "sequences").is_dir()
+    for told, scene in zip(direct.manifest(job)["scenes"], opened.scenes, strict=True):
+        assert [estimate["token"] for estimate in told["estimates"]] == [scan.token for scan in scene.scans]
+        assert all(0 <= estimate["estimate"] <= 1 for estimate in told["estimates"])
+        assert told["warnings"] == []
 
     done = direct.stages(job)
     assert {stage.state for stage in done} == {StageState.DONE}

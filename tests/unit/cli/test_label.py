@@ -1,5 +1,6 @@
 """``l3ps label``, ``l3ps bench`` and ``l3ps simulate`` as a user calls them."""
 
+import importlib.util
 import json
 import shutil
 
@@ -43,7 +44,27 @@ def test_a_drive_gets_labels_poses_and_a_report(small_drive, bundle, tmp_path):
     assert summary["preset"]["name"] == "paper"
     assert set(summary["quality"]) == {"primal", "refined"}
     assert set(summary["scenes"][0]["stages"]) == {"segment", "accumulate", "ground", "cluster", "vote", "instances"}
-    assert summary["scenes"][0]["points"] == sum(len(scan.load_points()) for scan in scene.scans)
+    told = summary["scenes"][0]
+    assert [row["token"] for row in told["estimates"]] == [scan.token for scan in scene.scans]
+    assert all(0 <= row["estimate"] <= 1 and row["pq"] is not None for row in told["estimates"])
+    assert told["rank_correlation"] is None, "two scans have no ranks worth the name"
+    assert told["poses"]["source"] == "kiss-icp", "as published"
+    assert told["points"] == sum(len(scan.load_points()) for scan in scene.scans)
+
+
+def test_poses_that_the_scans_contradict_are_told_and_reported(small_drive, bundle, tmp_path):
+    drive, report = tmp_path / "drive", tmp_path / "run.json"
+    shutil.copytree(small_drive, drive)
+    (table,) = drive.glob("v1.0-*/ego_pose.json")
+    rows = json.loads(table.read_text())
+    table.write_text(json.dumps([row | {"translation": [0, 0, 0]} for row in rows]))
+    result = run("label", drive, "--model", bundle, "--out", tmp_path / "o", "--report", report)
+    assert result.exit_code == 0, result.output
+    assert "under the log's poses" in result.stderr
+    (told,) = json.loads(report.read_text())["scenes"]
+    assert [problem["code"] for problem in told["warnings"]] == ["inconsistent-poses"]
+    assert (told["poses"]["source"], told["poses"]["parts"]) == ("kiss-icp", 1)
+    assert told["poses"]["residual"] < 0.5
 
 
 def test_the_same_input_gives_the_same_bytes(small_drive, bundle, tmp_path):
@@ -114,8 +135,54 @@ def test_bench_tells_every_stage_and_its_peers(small_drive):
     figures = json.loads(result.stdout)
     assert figures["scans"] == 1
     assert set(figures["stages"]) == {"accumulate", "ground", "cluster", "vote", "instances"}
-    assert all(cost["seconds"] >= 0 and cost["peak_mb"] > 10 for cost in figures["stages"].values())
-    assert figures["clustering"]["hdbscan"] > 0
+    for cost in figures["stages"].values():
+        assert cost["seconds"] >= 0 and cost["peak_mb"] > 10
+        assert cost["bytes_a_point"] == pytest.approx(cost["growth_mb"] * 2**20 / figures["points"])
+    assert figures["peak_mb"] == max(cost["peak_mb"] for cost in figures["stages"].values())
+    assert figures["bytes_a_point"] > 12, "the accumulated points alone take so much"
+    assert set(figures["clustering"]) == {"l3ps", "fast_hdbscan", "hdbscan"}
+    assert figures["clustering"]["l3ps"] > 0
+    for name in ("fast_hdbscan", "hdbscan"):
+        seconds, ratio = figures["clustering"][name], figures["ratios"][f"clustering_vs_{name}"]
+        if importlib.util.find_spec(name) is None:
+            assert seconds is None and ratio is None
+        else:
+            assert ratio == pytest.approx(seconds / figures["clustering"]["l3ps"])
+    drive = open_drive(small_drive)
+    sizes = [len(scan.load_points()) for scan in drive.scenes[0].scans]
+    assert [(row["scans"], row["points"]) for row in figures["growth"]] == [(1, sizes[0]), (2, sum(sizes))]
+    first, last = figures["growth"][0], figures["growth"][-1]
+    assert last["us_a_point"] == pytest.approx(1e6 * last["seconds"] / last["points"])
+    assert figures["ratios"]["growth_1_to_max"] == pytest.approx(last["us_a_point"] / first["us_a_point"])
+
+
+def test_bench_leaves_out_what_it_is_told_to(small_drive):
+    result = run("bench", "refine", "--log", small_drive, "--scans", 1, "--no-peers", "--no-growth", "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["growth"] == []
+    assert figures["clustering"]["l3ps"] > 0
+    assert (figures["clustering"]["hdbscan"], figures["clustering"]["fast_hdbscan"]) == (None, None)
+    assert set(figures["ratios"].values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [(("--scene", "x"), "no scene 'x'"), (("--preset", "x"), "no 'x'"), (("--log", "nowhere"), "no such file")],
+)
+def test_bench_refuses_in_one_sentence(small_drive, options, expected):
+    result = run("bench", "refine", "--log", small_drive, "--no-peers", *options)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+    assert "Traceback" not in result.output and "Usage" not in result.output
+
+
+def test_bench_says_which_scan_cannot_be_refined(spoilt_drive):
+    drive, scan = spoilt_drive
+    result = run("bench", "refine", "--log", drive, "--no-peers", "--no-growth")
+    assert result.exit_code == 2
+    assert scan.token in result.stderr
+    assert "Traceback" not in result.output
 
 
 def test_simulate_makes_a_drive_and_touches_no_folder_in_use(tmp_path):

@@ -80,3 +80,8 @@ def test_a_changed_vote_rule_refines_anew_from_the_same_primal_labels(
     (tmp_path / "segment/session.py").write_text("after")
     assert both()[0] != before[0]
     keys.code_version.cache_clear()
+
+
+def test_chunks_give_labels_of_their_own_but_a_budget_that_is_not_reached_does_not() -> None:
+    assert refine(max_points=1000) != refine(max_points=2000) != refine()
+    assert refine(max_points=None) == refine()

@@ -1,0 +1,156 @@
+"""A scene in chunks: every scan once, ids that go through the seams, and the labels of the whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from l3ps.drivelog.types import Points, Scan, Scene
+from l3ps.labels.types import ScanLabels
+from l3ps.pipeline import refine_scene
+from l3ps.presets import FAST
+from l3ps.refine.chunks import Chunk, Merger, plan, shared_points
+
+CAR, ROAD, MANMADE = 4, 11, 15
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=40), st.integers(1, 200), st.sets(st.integers(1, 39)))
+def test_chunks_keep_every_scan_once_and_stay_in_the_budget(sizes, max_points, cuts):
+    starts = (0, *sorted(cut for cut in cuts if cut < len(sizes)))
+    chunks = plan(sizes, starts, max_points)
+    kept = [scan for chunk in chunks for scan in range(chunk.kept_first, chunk.kept_stop)]
+    assert kept == list(range(len(sizes)))
+    for chunk in chunks:
+        assert chunk.first <= chunk.kept_first <= chunk.kept_stop <= chunk.stop
+        assert sum(sizes[chunk.first : chunk.stop]) <= max_points or chunk.stop - chunk.first == 1
+        assert not any(chunk.first < start < chunk.stop for start in starts), "a chunk reaches over a cut"
+
+
+def test_neighbouring_chunks_share_a_quarter_and_each_keeps_what_is_central():
+    assert plan([10] * 12, max_points=80) == [Chunk(0, 8, 0, 7), Chunk(6, 12, 7, 12)]
+    assert plan([10] * 12, max_points=120) == [Chunk(0, 12, 0, 12)]
+    assert plan([10] * 12) == [Chunk(0, 12, 0, 12)]
+    assert plan([10] * 4, starts=(0, 3)) == [Chunk(0, 3, 0, 3), Chunk(3, 4, 3, 4)]
+    assert plan([]) == []
+
+
+def labels(token, instance, semantic=CAR):
+    instance = np.array(instance, np.int32)
+    return ScanLabels(token, np.where(instance > 0, semantic, ROAD).astype(np.uint8), instance)
+
+
+def merged(*parts):
+    merger = Merger()
+    for chunk, scans in parts:
+        merger.add(chunk, scans)
+    return [scan.instance.tolist() for scan in merger.labels]
+
+
+def test_an_object_keeps_its_id_over_the_seam_and_others_get_new_ones():
+    first = [labels("a", [1, 1, 2, 2, 0]), labels("b", [1, 1, 2, 2, 0])]
+    # The second chunk counts anew: its 2 is the first's 1, its 1 the first's 2, and 3 is new.
+    second = [labels("b", [2, 2, 1, 1, 0]), labels("c", [2, 3, 3, 1, 0])]
+    assert merged((Chunk(0, 2, 0, 1), first), (Chunk(1, 3, 1, 3), second)) == [
+        [1, 1, 2, 2, 0],
+        [1, 1, 2, 2, 0],
+        [1, 3, 3, 2, 0],
+    ]
+
+
+def test_ids_do_not_meet_by_chance_in_chunks_that_share_nothing():
+    first, second = [labels("a", [1, 2])], [labels("b", [1, 2])]
+    assert merged((Chunk(0, 1, 0, 1), first), (Chunk(1, 2, 1, 2), second)) == [[1, 2], [3, 4]]
+
+
+def test_two_objects_never_become_one_by_the_seam():
+    """The first chunk holds as one what the second tells apart: the larger part keeps the id."""
+    first, second = [labels("a", [1, 1, 1, 1, 1])], [labels("a", [1, 1, 1, 2, 2])]
+    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 1, 2, 2]]
+
+
+def test_objects_of_different_classes_are_different():
+    first, second = [labels("a", [1, 1])], [labels("a", [1, 1], semantic=7)]
+    assert shared_points(first, second) == []
+    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[2, 2]]
+
+
+def test_one_chunk_comes_out_as_it_went_in():
+    scans = [labels("a", [7, 0, 3]), labels("b", [3, 3, 3])]
+    assert merged((Chunk(0, 2, 0, 2), scans)) == [[7, 0, 3], [3, 3, 3]]
+
+
+def test_other_arrays_of_the_labels_go_along():
+    merger = Merger()
+    scan = labels("a", [1])
+    merger.add(Chunk(0, 1, 0, 1), [scan])
+    assert merger.labels[0] == replace(scan, instance=merger.labels[0].instance)
+
+
+@pytest.fixture(scope="module")
+def long_street():
+    """Twelve scans along a street with a wall and a parked car every 12 m, 6,000 points each; and their truth."""
+    rng = np.random.default_rng(4)
+    ground = np.column_stack([rng.uniform(-40, 100, 30000), rng.uniform(-8, 8, 30000), rng.normal(-1.7, 0.01, 30000)])
+    wall = np.column_stack([rng.uniform(-40, 100, 20000), rng.choice([-9, 9], 20000), rng.uniform(-1.7, 3, 20000)])
+    cars = []
+    for number in range(11):
+        x = -36 + 12 * number
+        cars.append(np.column_stack([rng.uniform(x, x + 4, 900), rng.uniform(3, 5, 900), rng.uniform(-1.4, -0.1, 900)]))
+    world = np.concatenate([ground, wall, *cars])
+    truth = np.repeat([ROAD, MANMADE, CAR], [30000, 20000, 9900]).astype(np.uint8)
+    object_of = np.repeat(np.arange(12), [50000, *[900] * 11])
+    scans, primal, objects = [], [], []
+    for index in range(12):
+        near = np.abs(world[:, 0] - 4 * index) < 30
+        chosen = rng.permutation(np.flatnonzero(near))[:6000]
+        xyz = world[chosen] + rng.normal(0, 0.01, (6000, 3)) - [4 * index, 0, 0]
+        points = Points(xyz.astype(np.float32), np.full(6000, 0.3, np.float32))
+        pose = np.eye(4)
+        pose[0, 3] = 4 * index
+        token = f"scan{index}"
+        scans.append(Scan(token, index, index * 500_000, None, np.eye(4), pose, (), lambda points=points: points))
+        semantic = np.where(rng.random(6000) < 0.15, MANMADE, truth[chosen]).astype(np.uint8)
+        primal.append(ScanLabels(token, semantic, np.zeros(6000, np.int32)))
+        objects.append(object_of[chosen])
+    return Scene("street", tuple(scans)), primal, objects
+
+
+def test_chunks_give_the_labels_of_the_whole(long_street):
+    scene, primal, objects = long_street
+    largest = []
+
+    def spy(points, *rest, **named):
+        from l3ps.refine.cluster import hdbscan_package
+
+        largest.append(len(points))
+        return hdbscan_package(points, *rest, **named)
+
+    whole = refine_scene(scene, primal, FAST, sensor_height=1.7, clusterer=spy)
+    biggest = max(largest)
+    largest.clear()
+    seen = []
+    chunked = refine_scene(
+        scene,
+        primal,
+        FAST,
+        sensor_height=1.7,
+        clusterer=spy,
+        max_points=30000,
+        progress=lambda stage, done, total: seen.append((stage, done / total)),
+    )
+    assert max(largest) < 0.6 * biggest
+    for stage in ("cluster", "instances"):
+        told = [share for name, share in seen if name == stage]
+        assert told == sorted(told) and told[-1] == 1
+    assert [labels.token for labels in chunked.labels] == [scan.token for scan in scene.scans]
+    assert [estimate.token for estimate in chunked.estimates] == [scan.token for scan in scene.scans]
+    np.testing.assert_array_equal(chunked.poses, whole.poses)
+    differ = [(one.semantic != other.semantic).mean() for one, other in zip(chunked.labels, whole.labels, strict=True)]
+    assert np.mean(differ) < 0.02
+    for labels, truth in zip(chunked.labels, objects, strict=True):
+        for car in range(1, 12):
+            ids = labels.instance[(truth == car) & (labels.semantic == CAR)]
+            if len(ids) > 30:
+                assert (ids == np.bincount(ids).argmax()).mean() > 0.95
