@@ -10,7 +10,7 @@ out: no service, queue, database or terminal is known here. Progress goes throug
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ from l3ps.refine.accumulate import estimate_poses, transform
 from l3ps.refine.cluster import Clusterer, cluster_scene, hdbscan_package
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.instances import correct_instances, geometric_instances
-from l3ps.refine.vote import fill_unseen_ground, vote
+from l3ps.refine.verdict import decide
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
@@ -65,15 +65,15 @@ def primal_labels(scene: Scene, segmenter: Segmenter, progress: Progress = silen
     """
     total = sum(len(scan.cameras) for scan in scene.scans)
     done = 0
-    labels: list[ScanLabels] = []
-    for scan in scene.scans:
-        views = []
-        for camera in scan.cameras:
-            views.append((segmenter.segment(read_rgb(camera.path)), scan.lidar_to_camera(camera), camera.intrinsic))
+
+    def views(scan: Scan) -> Iterator[project.View]:
+        nonlocal done
+        for camera in scan.cameras:  # one image's scores at a time: they are the largest arrays of all
+            yield segmenter.segment(read_rgb(camera.path)), scan.lidar_to_camera(camera), camera.intrinsic
             done += 1
             progress("segment", done, total)
-        labels.append(ScanLabels(scan.token, *project.primal_labels(scan.load_points().xyz, views)))
-    return labels
+
+    return [ScanLabels(scan.token, *project.primal_labels(scan.load_points().xyz, views(scan))) for scan in scene.scans]
 
 
 def refine_scene(
@@ -124,21 +124,28 @@ def refine_scene(
         progress("cluster", 1, 1)
 
     with book.span("vote"):
-        semantic = vote(cluster, np.concatenate([labels.semantic for labels in primal]), preset.voting)
-        if preset.unseen_ground is not None:
-            semantic = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
+        bounds = np.cumsum([0, *(len(cloud) for cloud in clouds)])
+        verdict = decide(points, ground, cluster, bounds, primal, preset, threads)
         progress("vote", 1, 1)
 
     with book.span("instances"):
-        bounds = np.cumsum([0, *(len(cloud) for cloud in clouds)])
         refined: list[ScanLabels] = []
         for index, before in enumerate(track(primal, "instances", progress)):
             part = slice(bounds[index], bounds[index + 1])
+            semantic = verdict.semantic[part]
             if preset.instances == "published":
-                ids = correct_instances(points[part], before.semantic, before.instance, semantic[part])
+                ids = correct_instances(points[part], before.semantic, before.instance, semantic)
             else:
-                ids = geometric_instances(points[part], semantic[part], preset.instance_gap)
-            refined.append(ScanLabels(before.token, semantic[part], ids))
+                ids = geometric_instances(points[part], semantic, preset.instance_gap)
+            refined.append(
+                ScanLabels(
+                    before.token,
+                    semantic,
+                    ids,
+                    confidence=verdict.confidence[part],
+                    provenance=verdict.provenance[part],
+                )
+            )
 
     return RefinedScene(refined, poses, book.stages)
 

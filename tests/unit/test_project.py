@@ -48,7 +48,7 @@ def test_nan_and_zero_depth_points_are_not_seen():
 
 def test_a_point_no_camera_sees_is_void_and_ids_never_cross_cameras():
     xyz = np.array([[10, 0, 0], [-10, 0, 0], [0, 10, 0]], np.float32)
-    semantic, instance = primal_labels(xyz, [(painted(4, 1), FORWARD, K), (painted(4, 1), BACKWARD, K)])
+    semantic, instance, _ = primal_labels(xyz, [(painted(4, 1), FORWARD, K), (painted(4, 1), BACKWARD, K)])
     assert semantic.tolist() == [4, 4, 0]
     assert instance[0] != instance[1]
     assert instance[2] == 0
@@ -56,6 +56,6 @@ def test_a_point_no_camera_sees_is_void_and_ids_never_cross_cameras():
 
 def test_a_later_camera_overwrites_an_earlier_one():
     xyz = np.array([[10, 0, 0]], np.float32)
-    semantic, instance = primal_labels(xyz, [(painted(4, 3), FORWARD, K), (painted(11, 0), FORWARD, K)])
+    semantic, instance, _ = primal_labels(xyz, [(painted(4, 3), FORWARD, K), (painted(11, 0), FORWARD, K)])
     assert semantic.tolist() == [11]
     assert instance.tolist() == [0]
