@@ -58,7 +58,7 @@ def by_consensus(
     """Weigh the witnesses of every point of a scene.
 
     Args:
-        points: (N, 3) float32, metres, scene frame, z up; rows that are not finite keep to their own evidence.
+        points: (N, 3) float32, metres, scene frame, z up; rows that are not finite stay void.
         ground: (N,) bool partition.
         cluster: (N,) int32 ids from 0, -1 for points of no cluster.
         evidence: of all points.
@@ -68,6 +68,7 @@ def by_consensus(
         The opinion on each point.
     """
     counted = within_partition(evidence, ground, rules.crossing)
+    counted.weights[~np.isfinite(points).all(axis=1)] = 0  # a lost return is nothing
     group, cell, pair = _levels(points, ground, cluster, rules.cell)
     groups, cells = int(group.max(initial=-1)) + 1, int(cell.max(initial=-1)) + 1
 
@@ -128,10 +129,12 @@ def _levels(
 
     A cell is a cube of the partition, on the ground a square of any height.
     """
-    finite = np.isfinite(points).all(axis=1)
-    step = np.zeros(points.shape, dtype=np.int32)
-    if finite.any():
-        step[finite] = np.minimum((points[finite] - points[finite].min(axis=0)) / edge, _FARTHEST)
+    finite = np.isfinite(points.sum(axis=1))
+    place = points
+    if not finite.all():
+        place = np.where(finite[:, None], points, points[finite][0] if finite.any() else np.float32(0))
+    low = np.array([column.min(initial=np.inf) for column in place.T], dtype=np.float32)
+    step = np.minimum((place - low) / np.float32(edge), np.float32(_FARTHEST)).astype(np.int32)
     step[ground, 2] = 0
 
     # Ground squares of twice the edge take the numbers after the clusters; a point of neither is a group of one.
