@@ -35,19 +35,32 @@ class Voting:
 class Consensus:
     """How point, neighbourhood and cluster agree on a class (see :mod:`l3ps.refine.consensus`).
 
+    Measured on simulated drives kept for tuning (seeds 21 to 24), mean gain in mIoU over the primal labels, +15.7 with
+    the values below; and on the real recordings, where no class may lose more than 2 IoU.
+
     Attributes:
-        cell: edge in metres of a neighbourhood; twice that on the ground where clusters mean nothing.
-        neighbours: votes that the cluster's opinion counts for among those of a neighbourhood.
-        own: votes that the neighbourhood's opinion counts for beside the point's own.
-        crossing: share at which a vote across the ground partition counts.
-        favour: odds by which rare and small things are favoured.
+        cell: edge in metres of a neighbourhood. 0.45 gains 14.8, 0.5 14.9, 0.55 14.6, 0.6 15.5, 0.7 14.1; wider ones
+            cost pedestrians of the real keyframe up to 4 IoU.
+        square: edge in metres of the ground that takes a cluster's place, a multiple of ``cell``. 1 gains 15.1, 2 15.1,
+            4 15.7, 6 15.8, but at 6 cars of a real recording lose 2.7 to the ground they stand on.
+        level: metres of height within which ground is of one kind, below a kerb's height. 0.06 and 0.1 gain as much;
+            without it 14.9.
+        neighbours: votes that the cluster's opinion counts for among those of a neighbourhood. 3 gains 0.1 less; at 10
+            a bus that a real recording shows by ten points is lost.
+        own: votes that the neighbourhood's opinion counts for beside the point's own. 5 and 20 gain 0.1 less.
+        crossing: share at which a vote across the ground partition counts. 1 gains 0.8 less, 0 1.7 less; below 0.3
+            cars of the real recordings lose their lowest rows.
+        favour: odds by which rare and small things are favoured. 1 gains 0.3 more, but costs the pedestrians of the
+            real keyframe 4 IoU and the bus 9.
     """
 
     cell: float = 0.5
-    neighbours: float = 3.0
+    square: float = 4.0
+    level: float = 0.08
+    neighbours: float = 5.0
     own: float = 10.0
-    crossing: float = 0.3
-    favour: float = 1.7
+    crossing: float = 0.35
+    favour: float = 2.0
 
 
 @dataclass(frozen=True, slots=True)

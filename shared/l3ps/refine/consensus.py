@@ -5,9 +5,10 @@ piece of wall is a wall. Here each level is believed as far as it has evidence, 
 coarser one: the cluster's opinion counts as ``neighbours`` votes among those of a half-metre cell, the cell's as
 ``own`` votes beside those of the point itself (a hierarchical Dirichlet prior, MacKay and Peto 1995).
 
-    cluster, or 1 m of ground ──▶ cell of 0.5 m ──▶ point
+    cluster, or 4 m of level ground ──▶ cell of 0.5 m ──▶ point
 
-Ground has no clusters worth the name: HDBSCAN joins carriageway and pavement. A wider cell takes their place.
+Ground has no clusters worth the name: HDBSCAN joins carriageway and pavement. Wide squares take their place, parted
+where the height changes: a kerb is what tells one from the other.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def by_consensus(
     """
     counted = within_partition(evidence, ground, rules.crossing)
     counted.weights[~np.isfinite(points).all(axis=1)] = 0  # a lost return is nothing
-    group, cell, pair = _levels(points, ground, cluster, rules.cell)
+    group, cell, pair = _levels(points, ground, cluster, rules)
     groups, cells = int(group.max(initial=-1)) + 1, int(cell.max(initial=-1)) + 1
 
     of_group = _votes(group, counted, groups)
@@ -123,23 +124,25 @@ class _Pairs:
 
 
 def _levels(
-    points: NDArray[np.float32], ground: NDArray[np.bool_], cluster: NDArray[np.int32], edge: float
+    points: NDArray[np.float32], ground: NDArray[np.bool_], cluster: NDArray[np.int32], rules: Consensus
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], _Pairs]:
     """Each point's group and cell, and the pairs of both, from one sort.
 
-    A cell is a cube of the partition, on the ground a square of any height.
+    A cell is a cube of the partition, on the ground a plate of one level.
     """
     finite = np.isfinite(points.sum(axis=1))
     place = points
     if not finite.all():
         place = np.where(finite[:, None], points, points[finite][0] if finite.any() else np.float32(0))
     low = np.array([column.min(initial=np.inf) for column in place.T], dtype=np.float32)
-    step = np.minimum((place - low) / np.float32(edge), np.float32(_FARTHEST)).astype(np.int32)
-    step[ground, 2] = 0
+    step = np.minimum((place - low) / np.float32(rules.cell), np.float32(_FARTHEST)).astype(np.int32)
+    step[ground, 2] = np.minimum((place[ground, 2] - low[2]) / np.float32(rules.level), np.float32(_FARTHEST))
 
-    # Ground squares of twice the edge take the numbers after the clusters; a point of neither is a group of one.
+    # Ground squares take the numbers after the clusters; a point of neither is a group of one.
     group = cluster.astype(np.int64)
-    square = (step[ground, 0] // 2).astype(np.int64) * _FARTHEST + step[ground, 1] // 2
+    wide = max(1, round(rules.square / rules.cell))
+    square = (step[ground, 0] // wide).astype(np.int64) * _FARTHEST + step[ground, 1] // wide
+    square = square * _FARTHEST + step[ground, 2]
     group[ground] = int(cluster.max(initial=-1)) + 1 + np.unique(square, return_inverse=True)[1]
     alone = (group < 0) | ~finite
     group[alone] = int(group.max(initial=-1)) + 1 + np.arange(int(alone.sum()))
