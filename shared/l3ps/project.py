@@ -31,12 +31,15 @@ class Weighing:
             no vote from that camera; None lets all vote, as published.
         edge: pixels of the network's output from a label edge within which a vote counts less, down to half on the
             edge itself; 0 counts all the same.
+        near: metres of depth at which a vote counts half, nearer ones less: there a LiDAR puts hundreds of points on
+            what is one look at one surface, and parallax and motion shift them by most pixels. 0 counts all the same.
         label: share of a vote that goes to the panoptic label, from which segments too small to be things are gone;
             the rest goes by the network's probabilities.
     """
 
     occlusion: float | None = 0.1
     edge: float = 6.0
+    near: float = 8.0
     label: float = 0.5
 
 
@@ -101,7 +104,7 @@ def primal_labels(
         instance[seen] = np.where(ids > 0, ids + taken, 0)
         taken += int(image.instance.max(initial=0))
 
-        weight = np.ones(len(row), dtype=np.float32)
+        weight = np.asarray(1 / (1 + (weighing.near / depth[seen]) ** 2), dtype=np.float32)
         if weighing.edge:
             weight *= _edge_weight(image.semantic, weighing.edge)[row, column]
         if weighing.occlusion is not None:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l3ps.project import primal_labels, project
+from l3ps.project import Weighing, primal_labels, project
 from l3ps.segment.panoptic import ClassScores, PanopticImage
 
 SIZE = (200, 100)
@@ -88,7 +88,7 @@ def test_ground_that_runs_to_the_horizon_does_not_hide_itself():
 def test_cameras_that_overlap_vote_together_instead_of_overwriting():
     xyz = np.array([[10, 0, 0], [10, 1, 0]], np.float32)
     views = [(painted(c, 0), FORWARD, K) for c in (4, 4, 11)]
-    semantic, _, evidence = primal_labels(xyz, views)
+    semantic, _, evidence = primal_labels(xyz, views, Weighing(near=0))
     assert semantic.tolist() == [11, 11]
     assert evidence.classes[:, :2].tolist() == [[4, 11]] * 2
     assert evidence.weights[:, :2].tolist() == [[200, 100]] * 2
@@ -103,7 +103,7 @@ def test_probabilities_are_carried_and_share_the_vote_with_the_label():
     scores = ClassScores(logits, np.array([0, 4, 10, 10], np.uint8))
     image = PanopticImage(np.full((10, 20), 4, np.uint8), np.zeros((10, 20), np.int32), SIZE, scores)
     np.testing.assert_allclose(scores.at(np.array([3]), np.array([7]))[0, [0, 4, 10]], [1 / 6, 1 / 6, 4 / 6], rtol=1e-6)
-    _, _, evidence = primal_labels(np.array([[10, 0, 0]], np.float32), [(image, FORWARD, K)])
+    _, _, evidence = primal_labels(np.array([[10, 0, 0]], np.float32), [(image, FORWARD, K)], Weighing(near=0))
     assert dict(zip(evidence.classes[0].tolist(), evidence.weights[0].tolist(), strict=True)) == {4: 58, 10: 33, 0: 8}
 
 
@@ -112,10 +112,16 @@ def test_a_vote_from_a_label_edge_counts_less():
     semantic[:, :10] = 4
     image = PanopticImage(semantic, np.zeros((10, 20), np.int32), SIZE)
     xyz = np.array([[10, 0.1, 0], [10, 8.5, 0]], np.float32)  # pixels 9 and 1 of 20, the edge is at 10
-    _, _, evidence = primal_labels(xyz, [(image, FORWARD, K)])
+    _, _, evidence = primal_labels(xyz, [(image, FORWARD, K)], Weighing(near=0))
     assert evidence.classes[:, 0].tolist() == [4, 4]
     assert evidence.weights[0, 0] == 50
     assert evidence.weights[1, 0] == 100
+
+
+def test_points_near_the_camera_are_many_and_count_less_each():
+    xyz = np.array([[4, 0, 0], [8, 0, 0], [80, 0, 0]], np.float32)
+    weights = primal_labels(xyz, [(painted(4, 1), FORWARD, K)], Weighing(occlusion=None))[2].weights[:, 0]
+    assert weights.tolist() == [20, 50, 99]
 
 
 def test_no_points_no_cameras():

@@ -19,8 +19,8 @@ class Provenance(IntEnum):
 
     ``NONE``: void, nothing is known. ``CAMERA``: the point's own pixels settled it. ``NEIGHBOURS``: the points within
     some decimetres, over all scans. ``CLUSTER``: its geometric cluster. ``NOISE_FILL``: the cluster that noise was
-    given to. ``GROUND_RULE``: ground that no camera saw, or whose pixels said what ground cannot be. ``INSTANCE_RULE``:
-    the object it belongs to.
+    given to. ``GROUND_RULE``: the ground around it, which few or no cameras saw here; or its pixels said what ground
+    cannot be, or what nothing else can. ``INSTANCE_RULE``: the object it belongs to.
     """
 
     NONE = 0

@@ -40,6 +40,7 @@ def decide(
     primal: Sequence[ScanLabels],
     preset: Preset,
     threads: int = 2,
+    noise: NDArray[np.bool_] | None = None,
 ) -> Verdict:
     """Choose the class of every point of a scene.
 
@@ -51,6 +52,7 @@ def decide(
         primal: the primal labels, scan by scan.
         preset: which rules.
         threads: threads of the neighbour search.
+        noise: (N,) bool, points that HDBSCAN left out and that were given to a cluster afterwards; None if unknown.
 
     Returns:
         The verdict on each point.
@@ -63,7 +65,8 @@ def decide(
     else:
         opinion = by_consensus(points, ground, cluster, _evidence(primal, preset.evidence), preset.consensus)
         semantic, share = opinion.semantic, opinion.share
-        provenance = np.where(opinion.heard, Provenance.NEIGHBOURS, Provenance.CLUSTER).astype(np.uint8)
+        wider = np.where(ground, Provenance.GROUND_RULE, Provenance.CLUSTER)
+        provenance = np.where(opinion.heard, Provenance.NEIGHBOURS, wider).astype(np.uint8)
         provenance[semantic == before] = Provenance.CAMERA
         ruled_out = (before != VOID) & (NUSCENES16.is_ground[before] != ground)
         provenance[ruled_out & (semantic != before)] = Provenance.GROUND_RULE
@@ -76,6 +79,8 @@ def decide(
         filled = source >= 0
         share[filled] = share[source[filled]]
         provenance[filled] = Provenance.GROUND_RULE
+    if noise is not None:
+        provenance[noise & (provenance == Provenance.CLUSTER)] = Provenance.NOISE_FILL
     provenance[semantic == VOID] = Provenance.NONE
     return Verdict(semantic, as_confidence(share, semantic), provenance)
 
