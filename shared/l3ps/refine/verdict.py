@@ -12,7 +12,7 @@ from l3ps.labels.types import Evidence, Provenance, ScanLabels
 from l3ps.presets import Preset
 from l3ps.refine.confidence import as_confidence, cluster_share
 from l3ps.refine.consensus import by_consensus
-from l3ps.refine.object_class import vote_by_object
+from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
 from l3ps.refine.vote import fill_unseen_ground, vote
 from l3ps.taxonomy import NUSCENES16, VOID
 
@@ -71,7 +71,8 @@ def decide(
         ruled_out = (before != VOID) & (NUSCENES16.is_ground[before] != ground)
         provenance[ruled_out & (semantic != before)] = Provenance.GROUND_RULE
         if preset.object_vote is not None:
-            chosen, share = vote_by_object(points, bounds, opinion, preset.object_vote, preset.consensus.own)
+            found = objects_of_a_kind(points, bounds, semantic, preset.object_vote)
+            chosen, share = vote_by_object(found, opinion, preset.consensus.own)
             provenance[chosen != semantic] = Provenance.INSTANCE_RULE
             semantic = chosen
     if preset.unseen_ground is not None:

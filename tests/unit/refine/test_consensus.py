@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from l3ps.labels.types import Evidence
 from l3ps.presets import Consensus
 from l3ps.refine.consensus import by_consensus
-from l3ps.refine.object_class import vote_by_object
+from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
 
 VOID, BUS, CAR, PEDESTRIAN, TRUCK, ROAD, SIDEWALK, MANMADE = 0, 3, 4, 7, 10, 11, 13, 15
 RULES = Consensus()
@@ -134,7 +134,7 @@ def test_the_order_of_the_points_does_not_matter(rng):
 def objects(points, semantic, bounds=None, cluster=None):
     opinion = classes(points, semantic, cluster=np.arange(len(points)) if cluster is None else cluster)
     bounds = np.array([0, len(points)] if bounds is None else bounds)
-    return vote_by_object(points, bounds, opinion, 0.5, RULES.own)
+    return vote_by_object(objects_of_a_kind(points, bounds, opinion.semantic, 0.5), opinion, RULES.own)
 
 
 def test_a_bus_that_is_truck_at_one_end_is_a_bus(rng):
