@@ -210,5 +210,8 @@ def _settle(
     return semantic, share
 
 
-FAVOURED = tuple(NUSCENES16.things - {NUSCENES16.index("car"), NUSCENES16.index("truck")})
-"""Things that are few and small in every drive: a mistake costs them more than it costs what surrounds them."""
+_COMMON = {NUSCENES16.index("car"), NUSCENES16.index("truck")}
+FAVOURED = (*sorted(NUSCENES16.things - _COMMON), NUSCENES16.index("sidewalk"))
+"""Things that are few and small in every drive: a mistake costs them more than it costs what surrounds them. And the
+sidewalk, which the published rules favour too: networks take it for the terrain or the carriageway beside it (on
+simulated drives it gains 8 IoU by it, terrain 3). Trucks are left out, as cars are taken for them."""

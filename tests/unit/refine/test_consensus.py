@@ -10,7 +10,7 @@ from l3ps.presets import Consensus
 from l3ps.refine.consensus import by_consensus
 from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
 
-VOID, BUS, CAR, PEDESTRIAN, TRUCK, ROAD, SIDEWALK, MANMADE = 0, 3, 4, 7, 10, 11, 13, 15
+VOID, BICYCLE, BUS, CAR, PEDESTRIAN, TRAILER, TRUCK, ROAD, SIDEWALK, MANMADE = 0, 2, 3, 4, 7, 9, 10, 11, 13, 15
 RULES = Consensus()
 
 
@@ -95,6 +95,22 @@ def test_votes_weigh_by_their_confidence(rng):
     assert classes(points, [CAR, TRUCK, TRUCK]).semantic[1:].tolist() == [TRUCK] * 2, "by heads it is two to one"
 
 
+@pytest.mark.parametrize(("few", "many", "ground"), [(PEDESTRIAN, MANMADE, False), (SIDEWALK, ROAD, True)])
+def test_what_is_rare_wins_against_a_narrow_majority_of_what_is_common(few, many, ground):
+    points = np.zeros((100, 3), np.float32)
+    ballot = np.array([[few, many, VOID]] * 100, np.uint8)
+    for share, winner in ((40, few), (25, many)):
+        weights = np.array([[share, 100 - share, 0]] * 100, np.uint8)
+        seen = Evidence(ballot, weights, np.ones(100, np.uint8), np.ones(100, bool))
+        assert set(classes(points, [], ground=ground, evidence=seen).semantic) == {winner}
+
+
+def test_where_a_place_is_undecided_each_point_goes_by_its_own_pixels():
+    points = np.zeros((100, 3), np.float32)
+    semantic = np.repeat([CAR, MANMADE], 50)
+    np.testing.assert_array_equal(classes(points, semantic).semantic, semantic)
+
+
 def test_void_is_no_vote():
     points = np.zeros((10, 3), np.float32)
     found = classes(points, [VOID] * 9 + [CAR])
@@ -149,6 +165,19 @@ def test_two_vehicles_apart_choose_apart(rng):
     points = np.concatenate([box(rng, (0, 0, 0), (4, 2, 1.5), 800), box(rng, (5, 0, 0), (15, 2.5, 3), 800)])
     semantic = np.repeat([CAR, BUS], 800)
     np.testing.assert_array_equal(objects(points, semantic)[0], semantic)
+
+
+def test_an_object_of_many_opinions_stays_of_its_kind(rng):
+    """Four parts that are four vehicles to the network, and all of them second a bicycle: it is no bicycle."""
+    part = np.repeat(np.arange(4), 100)
+    points = np.column_stack([part + rng.random(400), rng.random(400), np.zeros(400)]).astype(np.float32)
+    ballot = np.array([[CAR, BICYCLE, 0], [TRUCK, BICYCLE, 0], [BUS, BICYCLE, 0], [TRAILER, BICYCLE, 0]], np.uint8)
+    weights = np.array([[70, 30, 0], [70, 30, 0], [52, 48, 0], [52, 48, 0]], np.uint8)
+    seen = Evidence(ballot[part], weights[part], np.ones(400, np.uint8), np.ones(400, bool))
+    opinion = classes(points, [], cluster=part, evidence=seen)
+    assert BICYCLE not in opinion.semantic
+    (winner,) = set(vote_by_object(np.ones(400, np.int32), opinion, RULES.own)[0].tolist())
+    assert winner in {CAR, TRUCK, BUS, TRAILER}
 
 
 @pytest.mark.parametrize("other", [PEDESTRIAN, MANMADE, ROAD])
