@@ -10,7 +10,7 @@ out: no service, queue, database or terminal is known here. Progress goes throug
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,16 +21,16 @@ from l3ps.costs import CostBook, StageCost
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
 from l3ps.evaluate.estimates import ScanEstimate, estimate_scans
-from l3ps.labels.types import ScanLabels
+from l3ps.labels.types import Provenance, ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent, track
 from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.accumulate import deskew, transform
 from l3ps.refine.chunks import Merger, plan, progress_of
 from l3ps.refine.ground import GroundSegmenter
-from l3ps.refine.instances import correct_instances, geometric_instances
+from l3ps.refine.identify import identify
 from l3ps.refine.poses import Motion, PoseTracker
-from l3ps.refine.vote import fill_unseen_ground, vote
+from l3ps.refine.verdict import decide
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
@@ -77,15 +77,15 @@ def primal_labels(scene: Scene, segmenter: Segmenter, progress: Progress = silen
     """
     total = sum(len(scan.cameras) for scan in scene.scans)
     done = 0
-    labels: list[ScanLabels] = []
-    for scan in scene.scans:
-        views = []
-        for camera in scan.cameras:
-            views.append((segmenter.segment(read_rgb(camera.path)), scan.lidar_to_camera(camera), camera.intrinsic))
+
+    def views(scan: Scan) -> Iterator[project.View]:
+        nonlocal done
+        for camera in scan.cameras:  # one image's scores at a time: they are the largest arrays of all
+            yield segmenter.segment(read_rgb(camera.path)), scan.lidar_to_camera(camera), camera.intrinsic
             done += 1
             progress("segment", done, total)
-        labels.append(ScanLabels(scan.token, *project.primal_labels(scan.load_points().xyz, views)))
-    return labels
+
+    return [ScanLabels(scan.token, *project.primal_labels(scan.load_points().xyz, views(scan))) for scan in scene.scans]
 
 
 def refine_scene(
@@ -201,23 +201,27 @@ def _refine_chunk(
         progress("cluster", 1, 1)
 
     with book.span("vote"):
-        votes = np.concatenate([labels.semantic for labels in primal])
-        semantic = vote(cluster, votes, preset.voting)
-        if preset.unseen_ground is not None:
-            semantic = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
+        verdict = decide(points, ground, cluster, bounds, primal, preset, threads)
         progress("vote", 1, 1)
 
     with book.span("instances"):
-        refined: list[ScanLabels] = []
-        for index, before in enumerate(track(primal, "instances", progress)):
-            part = slice(bounds[index], bounds[index + 1])
-            if preset.instances == "published":
-                ids = correct_instances(points[part], before.semantic, before.instance, semantic[part])
-            else:
-                ids = geometric_instances(points[part], semantic[part], preset.instance_gap)
-            refined.append(ScanLabels(before.token, semantic[part], ids))
+        times = np.array([scan.timestamp for scan in scans]) / 1e6
+        found = identify(points, bounds, ground, verdict.semantic, primal, motion.poses, times, preset)
+        verdict.provenance[found.semantic != verdict.semantic] = Provenance.INSTANCE_RULE
+        refined = [
+            ScanLabels(
+                labels.token,
+                found.semantic[part],
+                found.instance[part],
+                confidence=verdict.confidence[part],
+                provenance=verdict.provenance[part],
+            )
+            for labels, part in zip(primal, map(slice, bounds[:-1], bounds[1:]), strict=True)
+        ]
+        progress("instances", 1, 1)
         tokens = [labels.token for labels in primal]
-        estimates = estimate_scans(tokens, bounds, points, cluster, votes, semantic)
+        votes = np.concatenate([labels.semantic for labels in primal])
+        estimates = estimate_scans(tokens, bounds, points, cluster, votes, found.semantic)
 
     return refined, estimates
 

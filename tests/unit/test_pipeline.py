@@ -1,11 +1,13 @@
 """The whole refinement on a scene small enough to reason about."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from l3ps.drivelog.types import Points, Scan, Scene
 from l3ps.errors import Cancelled, LabelError, ProcessingError
-from l3ps.labels.types import ScanLabels
+from l3ps.labels.types import Evidence, Provenance, ScanLabels
 from l3ps.pipeline import REFINE_STAGES, refine_scene
 from l3ps.presets import PRESETS
 
@@ -142,3 +144,46 @@ def test_the_method_prints_nothing(scene_and_truth, capfd):
     scene, truth = scene_and_truth
     refine_scene(scene, noisy(scene, truth), PRESETS["fast"])
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_point_says_how_sure_its_label_is_and_where_it_comes_from(scene_and_truth, preset):
+    scene, truth = scene_and_truth
+    refined = refine_scene(scene, noisy(scene, truth), PRESETS[preset], sensor_height=1.7)
+    for labels, classes in zip(refined.labels, truth, strict=True):
+        assert labels.confidence.dtype == labels.provenance.dtype == np.uint8
+        void = labels.semantic == 0
+        assert ((labels.provenance == Provenance.NONE) == void).all()
+        assert ((labels.confidence == 0) >= void).all()
+        assert (labels.confidence[~void] > 0).all()
+        right = labels.semantic == classes
+        assert labels.confidence[right].mean() > labels.confidence[~right & ~void].mean()
+        assert {Provenance.CAMERA, Provenance.CLUSTER} & set(labels.provenance.tolist())
+
+
+def test_ground_that_no_camera_saw_is_labelled_by_the_ground_rule(scene_and_truth):
+    scene, truth = scene_and_truth
+    place = [scan.load_points().xyz[:, :2] + [0.5 * i - 6, 0] for i, scan in enumerate(scene.scans)]
+    near = [np.hypot(*xy.T) < 2 for xy in place]
+    unseen = [
+        ScanLabels(s.token, np.where(n, 0, s.semantic).astype(np.uint8), np.where(n, 0, s.instance))
+        for s, n in zip(noisy(scene, truth), near, strict=True)
+    ]
+    labels = refine_scene(scene, unseen, PRESETS["best"], sensor_height=1.7).labels[0]
+    below = (np.hypot(*place[0].T) < 1.2) & (truth[0] == ROAD)
+    assert (labels.semantic[below] == ROAD).mean() > 0.95
+    assert (labels.provenance[below] == Provenance.GROUND_RULE).mean() > 0.5
+
+
+def test_what_the_cameras_said_counts_for_more_than_the_labels_made_of_it(scene_and_truth):
+    scene, truth = scene_and_truth
+    labels = noisy(scene, truth)
+    told = []
+    for scan, classes in zip(labels, truth, strict=True):
+        evidence = Evidence.of_labels(classes)
+        told.append(replace(scan, evidence=replace(evidence, weights=np.minimum(evidence.weights, 30))))
+    with_evidence = refine_scene(scene, told, PRESETS["best"], sensor_height=1.7).labels[0].semantic
+    without = refine_scene(scene, labels, PRESETS["best"], sensor_height=1.7).labels[0].semantic
+    assert (with_evidence[7:] == truth[0][7:]).mean() > (without[7:] == truth[0][7:]).mean()
+    published = [refine_scene(scene, side, PRESETS["paper"], sensor_height=1.7).labels[0] for side in (told, labels)]
+    np.testing.assert_array_equal(published[0].semantic, published[1].semantic)

@@ -32,7 +32,7 @@ from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table
 
 T = TypeVar("T")
-LABEL_SUFFIXES = ("_panoptic.npz", "_lidarseg.bin", ".label")
+LABEL_SUFFIXES = ("_panoptic.npz", "_lidarseg.bin", ".label", "_confidence.npz")
 SHOWN_WARNINGS = 5
 PARTS = ("primal", "refined", "poses.txt", "scans.txt")
 

@@ -1,7 +1,8 @@
 """Panoptic nuScenes and nuScenes-lidarseg label files, in the index space of submissions (challenge classes).
 
 ``panoptic/<token>_panoptic.npz`` holds ``data``: uint16 ``class * 1000 + id``; ``lidarseg/<token>_lidarseg.bin`` holds
-one uint8 class a point. (Truth of nuScenes itself has the raw category in place of the class; see ``l3ps.drivelog``.)
+one uint8 class a point; for ``confidence/`` see :mod:`l3ps.labels.confidence`. (Truth of nuScenes itself has the raw
+category in place of the class; see ``l3ps.drivelog``.)
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l3ps.errors import LabelError, Problem
+from l3ps.labels import confidence
 from l3ps.labels.files import file_stem, write_whole
 from l3ps.labels.numbering import fitted_instances
 from l3ps.labels.types import ScanLabels
@@ -28,12 +30,12 @@ def write(out: Path, scene: str, labels: Sequence[ScanLabels]) -> list[Path]:
     """Write a scene's panoptic and lidarseg files.
 
     Args:
-        out: folder that gets ``panoptic/`` and ``lidarseg/``.
+        out: folder that gets ``panoptic/``, ``lidarseg/`` and, where labels have it, ``confidence/``.
         scene: the scene's name, for messages.
         labels: the scene's scans in order.
 
     Returns:
-        The files written, two a scan.
+        The files written, two a scan or three.
 
     Raises:
         LabelError: over 999 instances of one class in the scene, or a token that cannot be a file name.
@@ -47,6 +49,7 @@ def write(out: Path, scene: str, labels: Sequence[ScanLabels]) -> list[Path]:
         np.savez_compressed(panoptic, data=pack(scan.semantic, ids).astype(np.uint16))
         written.append(write_whole(out / "panoptic" / f"{stem}{PANOPTIC_SUFFIX}", panoptic.getvalue()))
         written.append(write_whole(out / "lidarseg" / f"{stem}{LIDARSEG_SUFFIX}", scan.semantic.tobytes()))
+        written += confidence.write(out, stem, scan)
     return written
 
 

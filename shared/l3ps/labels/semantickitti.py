@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
+from l3ps.labels import confidence
 from l3ps.labels.files import file_stem, folder_name, write_whole
 from l3ps.labels.numbering import fitted_instances
 from l3ps.labels.spaces import instances_in
@@ -44,7 +45,7 @@ def write(out: Path, scene: Scene, labels: Sequence[ScanLabels]) -> list[Path]:
         labels: the scene's scans in order.
 
     Returns:
-        The files written, one a scan.
+        The files written, one a scan, or two where the labels have confidences.
 
     Raises:
         LabelError: over 65,535 instances of one class in the scene, or a token that cannot be a file name.
@@ -54,12 +55,14 @@ def write(out: Path, scene: Scene, labels: Sequence[ScanLabels]) -> list[Path]:
     evaluated = np.asarray(NUSCENES16_TO_SEMANTICKITTI19)
     becomes_stuff = evaluated > max(SEMANTICKITTI19.things)
     instances = fitted_instances(scene.name, labels, evaluated, MAX_INSTANCE, NUSCENES16.is_thing & ~becomes_stuff)
-    folder = out / "sequences" / folder_name(scene.name) / "predictions"
+    sequence = out / "sequences" / folder_name(scene.name)
     names = {scan.token: file_name(scan) for scan in scene.scans}
     written = []
     for scan, ids in zip(labels, instances, strict=True):
         values = raw[scan.semantic] | ids.astype(np.uint32) << 16
-        written.append(write_whole(folder / names[scan.token], values.astype("<u4").tobytes()))
+        name = names[scan.token]
+        written.append(write_whole(sequence / "predictions" / name, values.astype("<u4").tobytes()))
+        written += confidence.write(sequence, name.removesuffix(SUFFIX), scan)
     return written
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from l3ps.drivelog.types import Scene
 from l3ps.labels import nuscenes, semantickitti
 from l3ps.labels.types import ScanLabels
@@ -21,7 +23,8 @@ def write_scene(out: Path, format: LabelFormat, scene: Scene, labels: Sequence[S
 
     Args:
         out: the folder, shared by all scenes of a drive.
-        format: ``nuscenes`` (panoptic npz and lidarseg bin) or ``semantickitti`` (.label).
+        format: ``nuscenes`` (panoptic npz and lidarseg bin) or ``semantickitti`` (.label); labels that have them get
+            a file of confidences beside either.
         scene: the scene the labels belong to.
         labels: scans in order; scans of the scene may be missing (bad scans that were skipped).
 
@@ -40,6 +43,9 @@ def write_scene(out: Path, format: LabelFormat, scene: Scene, labels: Sequence[S
             raise ValueError(f"scan {scan.token}: {scan.semantic.shape} classes but {scan.instance.shape} ids")
         if scan.semantic.size and (int(scan.semantic.max()) >= len(NUSCENES16.classes) or int(scan.instance.min()) < 0):
             raise ValueError(f"scan {scan.token}: classes must be 0–16 and ids at least 0")
+        for extra in (scan.confidence, scan.provenance):
+            if extra is not None and (extra.shape != scan.semantic.shape or extra.dtype != np.uint8):
+                raise ValueError(f"scan {scan.token}: confidence and provenance must be one byte a point")
     if format == "nuscenes":
         return nuscenes.write(out, scene.name, labels)
     if format == "semantickitti":

@@ -65,7 +65,7 @@ def fill_unseen_ground(
     semantic: NDArray[np.uint8],
     reach: float,
     threads: int = 2,
-) -> NDArray[np.uint8]:
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     """Give void ground points the class of the nearest point that is ground by partition and by label.
 
     The ground next to the vehicle lies below every camera's view: on nuScenes no camera sees it up to 5 m, which is a
@@ -79,15 +79,16 @@ def fill_unseen_ground(
         threads: threads of the neighbour search.
 
     Returns:
-        (N,) uint8 class.
+        (N,) uint8 class, and (N,) int32 the point each filled point took its class from, -1 for all others.
     """
     finite = np.isfinite(points).all(axis=1)
     known = np.flatnonzero(finite & ground & NUSCENES16.is_ground[semantic])
     unseen = np.flatnonzero(finite & ground & (semantic == VOID))
-    filled = semantic.copy()
+    filled, source = semantic.copy(), np.full(len(points), -1, dtype=np.int32)
     if len(known) and len(unseen):
         tree = cKDTree(points[known])
         distance, nearest = tree.query(points[unseen], distance_upper_bound=reach, workers=threads)
         near = np.isfinite(distance)
-        filled[unseen[near]] = semantic[known[nearest[near]]]
-    return filled
+        source[unseen[near]] = known[nearest[near]]
+        filled[unseen[near]] = semantic[source[unseen[near]]]
+    return filled, source

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import onnxruntime as ort
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from l3ps.errors import ModelError, Problem
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.images import network_input
-from l3ps.segment.panoptic import PanopticImage, fuse
+from l3ps.segment.panoptic import ClassScores, PanopticImage, fuse
 
 
 class Segmenter:
@@ -49,7 +51,7 @@ class Segmenter:
             image: (H, W, 3) uint8 RGB.
 
         Returns:
-            Panoptic labels at the resolution of the network's output.
+            Panoptic labels and class scores at the resolution of the network's output.
         """
         info = self.bundle.info
         names = [info.output.semantic] + ([info.output.boundary] if info.output.boundary else [])
@@ -61,7 +63,8 @@ class Segmenter:
         interior = None
         if info.output.boundary:
             interior = _at_size(outputs[1][0, 0], semantic.shape) >= info.output.boundary_threshold
-        return fuse(semantic, (image.shape[1], image.shape[0]), interior=interior, min_area=self.min_area)
+        labels = fuse(semantic, (image.shape[1], image.shape[0]), interior=interior, min_area=self.min_area)
+        return replace(labels, scores=ClassScores(logits, info.lut))
 
     def _check_signature(self) -> None:
         info = self.bundle.info

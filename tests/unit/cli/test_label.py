@@ -77,8 +77,9 @@ def test_a_second_run_replaces_the_first(small_drive, bundle, tmp_path):
     for label_format in ("nuscenes", "semantickitti"):
         result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o", "--format", label_format)
         assert result.exit_code == 0, result.output
-    assert not list((tmp_path / "o").rglob("*.npz"))
-    assert len(list((tmp_path / "o" / "refined").rglob("*.label"))) == 2
+    assert not list((tmp_path / "o").rglob("*_panoptic.npz"))
+    refined = tmp_path / "o" / "refined" / "sequences"
+    assert len(list(refined.rglob("*.label"))) == len(list(refined.rglob("*_confidence.npz"))) == 2
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,102 @@
+"""The classes of a scene by a preset's rules, how sure they are, and where each comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l3ps.labels.types import Evidence, Provenance, ScanLabels
+from l3ps.presets import Preset
+from l3ps.refine.confidence import as_confidence, cluster_share
+from l3ps.refine.consensus import by_consensus
+from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
+from l3ps.refine.vote import fill_unseen_ground, vote
+from l3ps.taxonomy import NUSCENES16, VOID
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is known of each point of a scene after the vote.
+
+    Attributes:
+        semantic: (N,) uint8 class.
+        confidence: (N,) uint8, 255 = certain: estimated probability that the class is right; 0 where it is void.
+        provenance: (N,) uint8, a :class:`~l3ps.labels.types.Provenance` a point.
+    """
+
+    semantic: NDArray[np.uint8]
+    confidence: NDArray[np.uint8]
+    provenance: NDArray[np.uint8]
+
+
+def decide(
+    points: NDArray[np.float32],
+    ground: NDArray[np.bool_],
+    cluster: NDArray[np.int32],
+    bounds: NDArray[np.integer],
+    primal: Sequence[ScanLabels],
+    preset: Preset,
+    threads: int = 2,
+    noise: NDArray[np.bool_] | None = None,
+) -> Verdict:
+    """Choose the class of every point of a scene.
+
+    Args:
+        points: (N, 3) float32, metres, scene frame, z up.
+        ground: (N,) bool partition.
+        cluster: (N,) int32 ids from 0, -1 for points of no cluster.
+        bounds: (S + 1,) where each scan begins among the points, and N.
+        primal: the primal labels, scan by scan.
+        preset: which rules.
+        threads: threads of the neighbour search.
+        noise: (N,) bool, points that HDBSCAN left out and that were given to a cluster afterwards; None if unknown.
+
+    Returns:
+        The verdict on each point.
+    """
+    before = np.concatenate([labels.semantic for labels in primal]) if primal else np.zeros(0, dtype=np.uint8)
+    if preset.consensus is None:
+        semantic = vote(cluster, before, preset.voting)
+        share = cluster_share(cluster, before, semantic)
+        provenance = np.where(semantic == before, Provenance.CAMERA, Provenance.CLUSTER).astype(np.uint8)
+    else:
+        opinion = by_consensus(points, ground, cluster, _evidence(primal, preset.evidence), preset.consensus)
+        semantic, share = opinion.semantic, opinion.share
+        wider = np.where(ground, Provenance.GROUND_RULE, Provenance.CLUSTER)
+        provenance = np.where(opinion.heard, Provenance.NEIGHBOURS, wider).astype(np.uint8)
+        provenance[semantic == before] = Provenance.CAMERA
+        ruled_out = (before != VOID) & (NUSCENES16.is_ground[before] != ground)
+        provenance[ruled_out & (semantic != before)] = Provenance.GROUND_RULE
+        if preset.object_vote is not None:
+            found = objects_of_a_kind(points, bounds, semantic, preset.object_vote)
+            chosen, share = vote_by_object(found, opinion, preset.consensus.own)
+            provenance[chosen != semantic] = Provenance.INSTANCE_RULE
+            semantic = chosen
+    if preset.unseen_ground is not None:
+        semantic, source = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
+        filled = source >= 0
+        share[filled] = share[source[filled]]
+        provenance[filled] = Provenance.GROUND_RULE
+    if noise is not None:
+        provenance[noise & (provenance == Provenance.CLUSTER)] = Provenance.NOISE_FILL
+    provenance[semantic == VOID] = Provenance.NONE
+    return Verdict(semantic, as_confidence(share, semantic), provenance)
+
+
+def _evidence(primal: Sequence[ScanLabels], wanted: bool) -> Evidence:
+    """The evidence of all scans; where there is none, each label is one vote."""
+    parts = [
+        labels.evidence if wanted and labels.evidence is not None else Evidence.of_labels(labels.semantic)
+        for labels in primal
+    ]
+    if not parts:
+        return Evidence.of_labels(np.zeros(0, dtype=np.uint8))
+    return Evidence(
+        np.concatenate([part.classes for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate([part.cameras for part in parts]),
+        np.concatenate([part.agree for part in parts]),
+    )
