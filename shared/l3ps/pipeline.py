@@ -27,6 +27,7 @@ from l3ps.refine.accumulate import estimate_poses, transform
 from l3ps.refine.cluster import Clusterer, cluster_scene, hdbscan_package
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.instances import correct_instances, geometric_instances
+from l3ps.refine.objects import scene_instances
 from l3ps.refine.vote import fill_unseen_ground, vote
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
@@ -131,10 +132,23 @@ def refine_scene(
 
     with book.span("instances"):
         bounds = np.cumsum([0, *(len(cloud) for cloud in clouds)])
+        scene_ids: NDArray[np.int32] | None = None
+        if preset.instances == "scene":
+            scene_ids, semantic = scene_instances(
+                points,
+                bounds,
+                ground,
+                semantic,
+                np.concatenate([labels.semantic for labels in primal]),
+                poses[:, :3, 3],
+                np.array([scan.timestamp for scan in scene.scans]) / 1e6,
+            )
         refined: list[ScanLabels] = []
         for index, before in enumerate(track(primal, "instances", progress)):
             part = slice(bounds[index], bounds[index + 1])
-            if preset.instances == "published":
+            if scene_ids is not None:
+                ids = scene_ids[part]
+            elif preset.instances == "published":
                 ids = correct_instances(points[part], before.semantic, before.instance, semantic[part])
             else:
                 ids = geometric_instances(points[part], semantic[part], preset.instance_gap)

@@ -1,0 +1,110 @@
+"""Objects of one scan from geometry: what hangs together, divided where it is larger than its class allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from l3ps.refine.kinds import KINDS, too_large
+from l3ps.refine.spots import Spots, compact, extents, linked, rectangle, top, total_votes
+
+NEAR = 20.0
+"""Metres up to which gaps are as they are; farther out they grow along the ray with the distance. With true classes and
+gaps of 0.7 m, thing PQ on the three recordings with box truth is 93.1, 98.4 and 99.5 so; it is 89.9, 73.6 and 87.3 with
+one gap at all distances."""
+_NARROWER = (0.75, 0.55, 0.4, 0.3)
+"""Shares of the gap at which what is too large is linked anew, until it falls apart."""
+_LEAST = 0.1
+"""Share of the whole below which a part is no object and joins the nearest other part."""
+
+Linker = Callable[[NDArray[np.intp], float], NDArray[np.intp]]
+"""(cells, share of the gap) → their components."""
+
+
+def find_fragments(spots: Spots) -> NDArray[np.intp]:
+    """(K,) fragment of each cell: cells of one scan and kind that hang together."""
+    gap = np.array([kind.gap for kind in KINDS])[spots.kind]
+    place = _drawn_in(spots) / gap[:, None]
+    layer = 2.0 * (spots.scan * len(KINDS) + spots.kind)
+
+    def at(cells: NDArray[np.intp], share: float) -> NDArray[np.intp]:
+        return linked(np.column_stack([place[cells] / share, layer[cells]]))
+
+    return divided(spots, spots.xy, at(np.arange(len(spots)), 1.0), np.arange(len(spots)), at)
+
+
+def divided(
+    spots: Spots, xy: NDArray[np.float64], whole: NDArray[np.intp], cell: NDArray[np.intp], link: Linker
+) -> NDArray[np.intp]:
+    """Divide what is too large for its class, at ever smaller gaps.
+
+    Args:
+        spots: the scene's.
+        xy: (C, 2) the cells to divide, metres.
+        whole: (C,) what each belongs to.
+        cell: (K,) which of these cells each of the spots lies in, -1 for none.
+        link: components of some of the cells at a share of the gap.
+
+    Returns:
+        (C,) numbers from 0 without holes.
+    """
+    inside = cell >= 0
+    votes = np.zeros((len(xy), spots.votes.shape[1]))
+    np.add.at(votes, cell[inside], spots.votes[inside])
+    weight = np.bincount(cell[inside], weights=spots.count[inside], minlength=len(xy)).astype(np.float64)
+    point_cell = cell[spots.of]
+    height, point_cell = spots.height[point_cell >= 0], point_cell[point_cell >= 0]
+    whole = compact(whole)
+    for share in _NARROWER:
+        if len(xy) == 0:
+            break
+        number = int(whole.max()) + 1
+        size = rectangle(extents(xy, whole, number))
+        large = too_large(total_votes(votes, whole, number), top(height, whole[point_cell], number), *size)
+        if not large.any():
+            break
+        own = np.flatnonzero(large[whole])
+        part = linked_within(link(own, share), whole[own])
+        part = _without_crumbs(xy[own], whole[own], part, weight[own])
+        whole = whole.copy()
+        whole[own] = number + part
+        whole = compact(whole)
+    return whole
+
+
+def linked_within(part: NDArray[np.intp], whole: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Parts that never reach over the bounds of a whole: a narrower gap could only cut, but numbers must tell."""
+    return compact(whole.astype(np.int64) * (int(part.max(initial=0)) + 1) + part)
+
+
+def _drawn_in(spots: Spots) -> NDArray[np.float64]:
+    """(K, 2) places around the sensor with the distance beyond :data:`NEAR` on a logarithmic scale.
+
+    A gap of constant size there is one that grows with the distance, along the ray more than across it: the beams'
+    steps in height put a far object's points far behind each other, those in azimuth stay small.
+    """
+    far = np.maximum(spots.distance, NEAR)
+    scaled = np.minimum(spots.distance, NEAR) + NEAR * np.log(far / NEAR)
+    return np.asarray(spots.bearing * scaled[:, None])
+
+
+def _without_crumbs(
+    xy: NDArray[np.float64], whole: NDArray[np.intp], part: NDArray[np.intp], weight: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """Parts with crumbs given to the nearest larger part of the same whole."""
+    of_part = np.bincount(part, weights=weight)
+    of_whole = np.bincount(whole, weights=weight)
+    largest = np.zeros(len(of_whole))
+    np.maximum.at(largest, whole, of_part[part])
+    crumb = of_part[part] < np.minimum(_LEAST * of_whole[whole], largest[whole])
+    if not crumb.any():
+        return part
+    apart = 1e4 * whole
+    tree = cKDTree(np.column_stack([xy, apart])[~crumb])
+    _, nearest = tree.query(np.column_stack([xy, apart])[crumb])
+    part = part.copy()
+    part[crumb] = part[~crumb][nearest]
+    return part
