@@ -52,27 +52,23 @@ def divided(
         (C,) numbers from 0 without holes.
     """
     inside = cell >= 0
-    votes = np.zeros((len(xy), spots.votes.shape[1]))
-    np.add.at(votes, cell[inside], spots.votes[inside])
+    votes = total_votes(spots.votes[inside], cell[inside], len(xy))
+    height = np.full(len(xy), -np.inf)
+    np.maximum.at(height, cell[inside], spots.height[inside])
     weight = np.bincount(cell[inside], weights=spots.count[inside], minlength=len(xy)).astype(np.float64)
-    point_cell = cell[spots.of]
-    height, point_cell = spots.height[point_cell >= 0], point_cell[point_cell >= 0]
-    whole = compact(whole)
+    done = compact(whole)
+    rest, part = np.arange(len(xy)), done
     for share in _NARROWER:
-        if len(xy) == 0:
-            break
-        number = int(whole.max()) + 1
-        size = rectangle(extents(xy, whole, number))
-        large = too_large(total_votes(votes, whole, number), top(height, whole[point_cell], number), *size)
+        number = int(part.max(initial=-1)) + 1
+        length, width = rectangle(extents(xy[rest], part, number))
+        large = too_large(total_votes(votes[rest], part, number), top(height[rest], part, number), length, width)[part]
         if not large.any():
             break
-        own = np.flatnonzero(large[whole])
-        part = linked_within(link(own, share), whole[own])
-        part = _without_crumbs(xy[own], whole[own], part, weight[own])
-        whole = whole.copy()
-        whole[own] = number + part
-        whole = compact(whole)
-    return whole
+        rest, part = rest[large], compact(part[large])
+        narrower = linked_within(link(rest, share), part)
+        part = compact(_without_crumbs(xy[rest], part, narrower, weight[rest]))
+        done[rest] = int(done.max()) + 1 + part
+    return compact(done)
 
 
 def linked_within(part: NDArray[np.intp], whole: NDArray[np.intp]) -> NDArray[np.intp]:

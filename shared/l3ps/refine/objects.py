@@ -69,6 +69,6 @@ def _classes(spots: Spots, found: NDArray[np.intp]) -> NDArray[np.uint8]:
     names, view = np.unique(found.astype(np.int64) * scans + spots.scan, return_inverse=True)
     of = names // scans
     length, width = rectangle(extents(spots.xy, view, len(names)))
-    height = top(spots.height, view[spots.of], len(names))
+    height = top(spots.height, view, len(names))
     usual = [quantile(values, of, number, _USUAL) for values in (height, length, width)]
     return likely_class(total_votes(spots.votes, found, number), *usual).astype(np.uint8)

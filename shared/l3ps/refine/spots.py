@@ -13,17 +13,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from l3ps.refine.kinds import CLASSES, KIND_OF
+from l3ps.refine.kinds import CLASSES, KIND_OF, KINDS
 from l3ps.taxonomy import NUSCENES16, VOID
 
-_CELL = 0.12
-"""Metres; a seventh of a vehicle's gap, so that linking cells is linking points to a seventh of the gap."""
+_CELLS_A_GAP = 4
+"""Linking cells is linking points to a quarter of the gap."""
 _REFINED = 0.2
 """Votes that a point's refined class adds to the one of its primal class."""
 _GROUND_CELL = 4.0
 """Metres of road that have one height."""
-_TOP = 0.97
-"""Share of an object's points that lie below its top: a few belong to the tree above it."""
+_TOP = 0.9
+"""Share of an object's cells that lie below its top: a few hold points of the tree above it."""
 _ANGLES = np.radians(np.arange(0.0, 90.0, 7.5))
 _AXES = np.concatenate(
     [np.stack([np.cos(_ANGLES), np.sin(_ANGLES)]), np.stack([-np.sin(_ANGLES), np.cos(_ANGLES)])], axis=1
@@ -37,10 +37,10 @@ class Spots:
     Attributes:
         member: (M,) index of each thing point among the scene's points.
         of: (M,) its cell.
-        height: (M,) its height above the ground, metres.
         xy: (K, 2) mean of each cell's points, metres, scene frame.
         scan: (K,) scan.
         kind: (K,) index into :data:`l3ps.refine.kinds.KINDS`.
+        height: (K,) its highest point above the ground, metres.
         count: (K,) points.
         distance: (K,) metres from the sensor.
         bearing: (K, 2) unit vector from the sensor.
@@ -49,10 +49,10 @@ class Spots:
 
     member: NDArray[np.intp]
     of: NDArray[np.intp]
-    height: NDArray[np.float32]
     xy: NDArray[np.float64]
     scan: NDArray[np.intp]
     kind: NDArray[np.intp]
+    height: NDArray[np.float64]
     count: NDArray[np.float64]
     distance: NDArray[np.float64]
     bearing: NDArray[np.float64]
@@ -84,7 +84,8 @@ def find_spots(
     scan_of = np.searchsorted(bounds, member, side="right") - 1
     kind_of = KIND_OF[semantic[member]]
     own = points[member, :2].astype(np.float64)
-    of, count = _cells(own, scan_of * len(KIND_OF) + kind_of, _CELL)
+    edge = np.array([kind.gap for kind in KINDS])[kind_of] / _CELLS_A_GAP
+    of, count = _cells(own / edge[:, None], scan_of * len(KINDS) + kind_of)
     number = len(count)
     xy = np.stack([np.bincount(of, weights=own[:, axis], minlength=number) for axis in (0, 1)], axis=1) / count[:, None]
     scan, kind = np.zeros(number, dtype=np.intp), np.zeros(number, dtype=np.intp)
@@ -95,14 +96,15 @@ def find_spots(
     votes = np.bincount(of * CLASSES + first, minlength=number * CLASSES) + _REFINED * np.bincount(
         of * CLASSES + semantic[member], minlength=number * CLASSES
     )
-    height = points[member, 2] - _ground_height(points, ground, xy)[of]
+    order = np.argsort(of, kind="stable")
+    highest = np.maximum.reduceat(points[member[order], 2], np.cumsum(count) - count) if number else np.zeros(0)
     return Spots(
         member,
         of,
-        height.astype(np.float32),
         xy,
         scan,
         kind,
+        highest - _ground_height(points, ground, xy),
         count.astype(np.float64),
         distance,
         away / np.maximum(distance, 1e-9)[:, None],
@@ -149,8 +151,8 @@ def total_votes(votes: NDArray[np.float64], label: NDArray[np.integer], number: 
     return np.stack([np.bincount(label, weights=votes[:, c], minlength=number) for c in range(CLASSES)], axis=1)
 
 
-def top(height: NDArray[np.float32], label: NDArray[np.integer], number: int) -> NDArray[np.float32]:
-    """(number,) height that few of a set's points exceed; sets must not be empty."""
+def top(height: NDArray[np.floating], label: NDArray[np.integer], number: int) -> NDArray[np.floating]:
+    """(number,) height that few of a set's cells exceed; sets must not be empty."""
     return quantile(height, label, number, _TOP)
 
 
@@ -164,13 +166,11 @@ def quantile(
     return np.asarray(values[order[first + np.floor(share * (count - 1) + 0.5).astype(np.intp)]])
 
 
-def _cells(
-    xy: NDArray[np.float64], group: NDArray[np.integer], edge: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Cell of each point and points of each cell; points of two groups share none."""
+def _cells(xy: NDArray[np.float64], group: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Unit cell of each point and points of each cell; points of two groups share none."""
     if len(xy) == 0:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    key = np.floor((xy - xy.min(axis=0)) / edge).astype(np.int64)
+    key = np.floor(xy - np.floor(xy.min(axis=0))).astype(np.int64)
     wide = key.max(axis=0) + 1
     flat = (group.astype(np.int64) * wide[0] + key[:, 0]) * wide[1] + key[:, 1]
     _, of, count = np.unique(flat, return_inverse=True, return_counts=True)
@@ -185,6 +185,6 @@ def _ground_height(
     known = known[np.isfinite(points[known]).all(axis=1)]
     if len(known) == 0 or len(xy) == 0:
         return np.zeros(len(xy))
-    of, count = _cells(points[known, :2].astype(np.float64), np.zeros(len(known), dtype=np.intp), _GROUND_CELL)
+    of, count = _cells(points[known, :2].astype(np.float64) / _GROUND_CELL, np.zeros(len(known), dtype=np.intp))
     mean = np.stack([np.bincount(of, weights=points[known, axis]) for axis in range(3)], axis=1) / count[:, None]
     return np.asarray(mean[cKDTree(mean[:, :2]).query(xy)[1], 2])

@@ -76,8 +76,7 @@ def _joined(
     inside = cell >= 0
     votes = total_votes(spots.votes[inside], part[cell[inside]], number)
     mass = votes.sum(axis=1)
-    point_cell = cell[spots.of]
-    height = top(spots.height[point_cell >= 0], part[point_cell[point_cell >= 0]], number)
+    height = top(spots.height[inside], part[cell[inside]], number)
     extent = extents(xy, part, number)
     parent = list(range(number))
 

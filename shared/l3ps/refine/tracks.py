@@ -44,6 +44,8 @@ _STILL = 0.35
 """Metres of displacement that are taken for none."""
 _STANDS = 0.1
 """Agreement by which the view must be better displaced than in place for the object to count as moving."""
+_SAMPLE = 64
+"""Cells of a view that are looked up in the other; more do not tell more."""
 _KEPT = 0.2
 """Edge in metres of the cells in which a standing object's places are kept."""
 
@@ -223,7 +225,8 @@ def _update(
             track.places = cells
         else:
             both = np.concatenate([track.places, cells])
-            track.places = both[np.unique(np.round(both / _KEPT).astype(np.int64), axis=0, return_index=True)[1]]
+            key = np.round(both / _KEPT).astype(np.int64)
+            track.places = both[np.unique(key[:, 0] << 32 ^ key[:, 1] & 0xFFFFFFFF, return_index=True)[1]]
 
 
 def _displacement(before: list[Places], after: list[Places], predicted: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -241,14 +244,25 @@ def _displacement(before: list[Places], after: list[Places], predicted: NDArray[
     guesses = np.stack([np.zeros((number, 2)), middle[1] - middle[0], mean[1] - mean[0], predicted])
     old_tree = cKDTree(np.column_stack([old, 100.0 * of_old]))
     new_tree = cKDTree(np.column_stack([new, 100.0 * of_new]))
+    sample_old, sample_new = _sample(of_old), _sample(of_new)
     agreement = np.zeros((len(guesses), number))
     for row, shift in enumerate(guesses):
-        for tree, cells, of in ((new_tree, old + shift[of_old], of_old), (old_tree, new - shift[of_new], of_new)):
+        for tree, cells, of in (
+            (new_tree, (old + shift[of_old])[sample_old], of_old[sample_old]),
+            (old_tree, (new - shift[of_new])[sample_new], of_new[sample_new]),
+        ):
             away, _ = tree.query(np.column_stack([cells, 100.0 * of]), distance_upper_bound=_FINE)
             share = np.bincount(of, weights=np.isfinite(away)) / np.bincount(of)
             agreement[row] = np.maximum(agreement[row], share)
     agreement[0] += _STANDS
     return np.asarray(guesses[agreement.argmax(axis=0), np.arange(number)])
+
+
+def _sample(of: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Indices of every so many cells of each view, some :data:`_SAMPLE` of it; ``of`` ascends."""
+    count = np.bincount(of)
+    rank = np.arange(len(of)) - (np.cumsum(count) - count)[of]
+    return np.flatnonzero(rank % np.maximum(count // _SAMPLE, 1)[of] == 0)
 
 
 def _nearest(points: Places, queries: Places, reach: float) -> NDArray[np.intp]:
