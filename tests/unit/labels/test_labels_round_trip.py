@@ -138,7 +138,7 @@ def test_more_objects_than_the_format_can_number_is_an_error_that_leaves_nothing
 
 
 def test_where_numbers_run_out_only_objects_of_one_scan_share_them(make_scene, tmp_path):
-    """A scene has more objects than the format numbers, but no scan has: those seen again keep a number of their own."""
+    """A scene has more objects than the format numbers, but no scan has: those seen again keep their own."""
     scene = make_scene("long", ["a", "b", "c"])
     of_scan = [[*range(1, 301), *range(1000 * k, 1000 * k + 400)] for k in (1, 2, 3)]
     labels = [
