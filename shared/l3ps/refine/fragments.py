@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from l3ps.refine.kinds import KINDS, too_large
@@ -17,6 +20,10 @@ gaps of 0.7 m, thing PQ on the three recordings with box truth is 93.1, 98.4 and
 one gap at all distances."""
 _NARROWER = (0.75, 0.55, 0.4, 0.3)
 """Shares of the gap at which what is too large is linked anew, until it falls apart."""
+_MINGLED = 0.3
+"""Metres within which cells of two kinds touch."""
+_INSIDE = 0.5
+"""Share of a fragment's cells that touch a larger one of another kind where the two are one."""
 _LEAST = 0.1
 """Share of the whole below which a part is no object and joins the nearest other part."""
 
@@ -104,3 +111,33 @@ def _without_crumbs(
     part = part.copy()
     part[crumb] = part[~crumb][nearest]
     return part
+
+
+def of_one_kind(spots: Spots, label: NDArray[np.intp]) -> Spots:
+    """The cells with the kind that most points of their fragment or track have."""
+    number = int(label.max(initial=-1)) + 1
+    points = np.stack(
+        [np.bincount(label, weights=spots.count * (spots.kind == k), minlength=number) for k in range(len(KINDS))]
+    )
+    return replace(spots, kind=points.argmax(axis=0)[label])
+
+
+def mingled(spots: Spots, fragment: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(K,) fragments, where those of several kinds that lie in each other are one: a cyclist on a bicycle that is half
+    called car.
+    """
+    pairs = cKDTree(np.column_stack([spots.xy, 2.0 * spots.scan])).query_pairs(_MINGLED, output_type="ndarray")
+    pairs = pairs[spots.kind[pairs[:, 0]] != spots.kind[pairs[:, 1]]]
+    if len(pairs) == 0:
+        return fragment
+    number = int(fragment.max()) + 1
+    points = np.bincount(fragment, weights=spots.count, minlength=number)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    inner, outer = both[:, 0], fragment[both[:, 1]]
+    smaller = points[fragment[inner]] < points[outer]
+    touch = np.unique(inner[smaller] * number + outer[smaller])
+    ends, share = np.unique(fragment[touch // number] * number + touch % number, return_counts=True)
+    small, large = ends // number, ends % number
+    inside = share / np.bincount(fragment, minlength=number)[small] >= _INSIDE
+    graph = coo_matrix((np.ones(int(inside.sum()), dtype=bool), (small[inside], large[inside])), shape=(number,) * 2)
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)[fragment]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l3ps.refine.fragments import find_fragments
+from l3ps.refine.fragments import find_fragments, mingled, of_one_kind
 from l3ps.refine.kinds import likely_class
 from l3ps.refine.spots import Spots, extents, find_spots, quantile, rectangle, top, total_votes
 from l3ps.refine.standing import standing_objects
@@ -46,7 +46,9 @@ def scene_instances(
     instance = np.zeros(len(points), dtype=np.int32)
     if len(spots) == 0:
         return instance, semantic
-    found = standing_objects(spots, follow(spots, find_fragments(spots), seconds))
+    fragment = mingled(spots, find_fragments(spots))
+    tracks = follow(of_one_kind(spots, fragment), fragment, seconds)
+    found = standing_objects(of_one_kind(spots, tracks.of), tracks)
     found = _by_first_cell(found)
     instance[spots.member] = found[spots.of] + 1
     refined = semantic.copy()
