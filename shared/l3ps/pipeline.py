@@ -142,6 +142,7 @@ def refine_scene(
                 np.concatenate([labels.semantic for labels in primal]),
                 poses[:, :3, 3],
                 np.array([scan.timestamp for scan in scene.scans]) / 1e6,
+                one_class=preset.instance_class,
             )
         refined: list[ScanLabels] = []
         for index, before in enumerate(track(primal, "instances", progress)):

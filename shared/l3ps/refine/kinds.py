@@ -18,25 +18,29 @@ CLASSES = len(NUSCENES16.classes)
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Bounds of the visible part of an object of a class, metres."""
+    """Bounds of the visible part of an object of a class, metres.
+
+    ``least`` is the length in the bird's-eye view that some scan shows of an object that several scans see from near.
+    """
 
     length: float
     width: float
     lowest: float
     highest: float
+    least: float = 0.0
 
 
 SIZES: dict[str, Size] = {
     "barrier": Size(3.0, 1.3, 0.5, 1.5),
     "bicycle": Size(2.4, 1.3, 0.6, 2.1),
-    "bus": Size(14.0, 3.8, 2.5, 4.5),
-    "car": Size(7.5, 3.5, 0.9, 2.3),
-    "construction_vehicle": Size(10.0, 4.5, 1.8, 5.0),
+    "bus": Size(14.0, 3.8, 2.5, 4.5, 5.0),
+    "car": Size(7.5, 3.5, 0.9, 2.3, 2.5),
+    "construction_vehicle": Size(10.0, 4.5, 1.8, 5.0, 2.5),
     "motorcycle": Size(2.8, 1.6, 0.7, 2.1),
     "pedestrian": Size(1.4, 1.4, 0.8, 2.2),
     "traffic_cone": Size(1.0, 1.0, 0.3, 1.3),
-    "trailer": Size(14.0, 3.8, 1.7, 4.5),
-    "truck": Size(12.0, 3.8, 1.7, 4.5),
+    "trailer": Size(14.0, 3.8, 1.7, 4.5, 2.5),
+    "truck": Size(12.0, 3.8, 1.7, 4.5, 2.5),
 }
 
 
@@ -76,6 +80,7 @@ def _of_class(attribute: str, missing: float) -> NDArray[np.float64]:
 
 
 LENGTH, WIDTH = _of_class("length", np.inf), _of_class("width", np.inf)
+LEAST = _of_class("least", 0.0)
 LOWEST, HIGHEST = _of_class("lowest", 0.0), _of_class("highest", np.inf)
 KIND_OF = np.full(CLASSES, -1)
 """(17,) kind of each class, -1 for stuff and void."""
@@ -83,7 +88,7 @@ for _number, _kind in enumerate(KINDS):
     KIND_OF[[NUSCENES16.index(name) for name in _kind.classes]] = _number
 
 _UNFIT = 0.15
-"""What a vote counts for a class that the object is too large, too high or too low for."""
+"""What a vote counts for a class that the object is too large, too high, too low or too short for."""
 _LONGER, _WIDER, _HIGHER, _LOWER = 1.1, 1.15, 1.05, 0.9
 """How far out of its bounds an object must be to be unfit."""
 
@@ -93,6 +98,7 @@ def likely_class(
     height: NDArray[np.floating],
     length: NDArray[np.floating] | None = None,
     width: NDArray[np.floating] | None = None,
+    longest: NDArray[np.floating] | None = None,
 ) -> NDArray[np.intp]:
     """The thing class with the most votes among those that fit an object's size.
 
@@ -101,6 +107,7 @@ def likely_class(
         height: (K,) top of the object above the ground, metres.
         length: (K,) of its rectangle in the bird's-eye view, metres; None where it is not to decide.
         width: (K,) likewise.
+        longest: (K,) its length where most of it is seen, infinite where that may not be much; None likewise.
 
     Returns:
         (K,) class.
@@ -110,6 +117,8 @@ def likely_class(
         unfit |= length[:, None] > LENGTH * _LONGER
     if width is not None:
         unfit |= width[:, None] > WIDTH * _WIDER
+    if longest is not None:
+        unfit |= longest[:, None] < LEAST
     weighed = (votes + 1e-3) * np.where(unfit, _UNFIT, 1.0)
     return np.asarray(np.where(NUSCENES16.is_thing, weighed, -1.0).argmax(axis=1))
 

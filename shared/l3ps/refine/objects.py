@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from l3ps.refine.fragments import find_fragments, mingled, of_one_kind
+from l3ps.refine.fragments import NEAR, find_fragments, mingled, of_one_kind
 from l3ps.refine.kinds import likely_class
 from l3ps.refine.spots import Spots, extents, find_spots, quantile, rectangle, top, total_votes
 from l3ps.refine.standing import standing_objects
@@ -16,6 +16,10 @@ from l3ps.refine.tracks import follow
 
 _USUAL = 0.6
 """Share of an object's scans whose view is no larger than the size that decides its class."""
+_MOST = 0.9
+"""The same for the size that it must reach."""
+_SEVERAL = 3
+"""Scans, one of them from within :data:`~l3ps.refine.fragments.NEAR`, that show an object's whole length."""
 
 
 def scene_instances(
@@ -26,6 +30,8 @@ def scene_instances(
     primal: NDArray[np.uint8],
     origins: NDArray[np.float64],
     seconds: NDArray[np.float64],
+    *,
+    one_class: bool = True,
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """Find the objects of a scene, follow them through its scans and let each choose one class.
 
@@ -37,6 +43,7 @@ def scene_instances(
         primal: (N,) uint8 class before it; its things vote for the objects' classes.
         origins: (S, 3) the sensor's place at each scan, metres, scene frame.
         seconds: (S,) time of each scan, ascending.
+        one_class: let each object choose one class; else points keep theirs, and an object may have several.
 
     Returns:
         (N,) int32 id from 1, one an object in all scans and unique over all classes, 0 for stuff, void and points that
@@ -51,6 +58,8 @@ def scene_instances(
     found = standing_objects(of_one_kind(spots, tracks.of), tracks)
     found = _by_first_cell(found)
     instance[spots.member] = found[spots.of] + 1
+    if not one_class:
+        return instance, semantic
     refined = semantic.copy()
     refined[spots.member] = _classes(spots, found)[found][spots.of]
     return instance, refined
@@ -72,5 +81,9 @@ def _classes(spots: Spots, found: NDArray[np.intp]) -> NDArray[np.uint8]:
     of = names // scans
     length, width = rectangle(extents(spots.xy, view, len(names)))
     height = top(spots.height, view, len(names))
-    usual = [quantile(values, of, number, _USUAL) for values in (height, length, width)]
-    return likely_class(total_votes(spots.votes, found, number), *usual).astype(np.uint8)
+    high, long, wide = (quantile(values, of, number, _USUAL) for values in (height, length, width))
+    distance = np.full(number, np.inf)
+    np.minimum.at(distance, found, spots.distance)
+    well_seen = (distance < NEAR) & (np.bincount(of, minlength=number) >= _SEVERAL)
+    longest = np.where(well_seen, quantile(length, of, number, _MOST), np.inf)
+    return likely_class(total_votes(spots.votes, found, number), high, long, wide, longest).astype(np.uint8)

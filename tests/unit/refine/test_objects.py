@@ -169,6 +169,28 @@ def test_the_class_that_most_scans_saw_holds_in_all():
     assert {int(c) for mine in boxes for c in semantic[mine[0]]} == {CAR}
 
 
+def test_what_several_scans_show_to_be_short_is_no_car():
+    bicycle = [Box(CAR, 8, 6, 1.7, 0.6, 1.7), Box(BICYCLE, 8, 6, 1.0, 0.4, 1.2)]
+    arguments, boxes = scene(*[bicycle] * 4)
+    _, semantic = scene_instances(*arguments)
+    assert {int(c) for mine in boxes for part in mine for c in semantic[part]} == {BICYCLE}
+
+
+def test_a_cyclist_half_called_pedestrian_is_one_object_though_it_moves():
+    def cyclist(x):
+        return [Box(BICYCLE, x, 4, 1.7, 0.5, 1.0), Box(PEDESTRIAN, x, 4, 0.6, 0.4, 1.7)]
+
+    found = ids_of(*[cyclist(-8 + 2.0 * t) for t in range(8)])
+    assert len(set.union(*(ids for scan in found for ids in scan))) == 1
+
+
+def test_classes_stay_as_they_are_where_objects_are_not_to_choose():
+    arguments, _ = scene([Box(CAR, 8, 6, 2.2), Box(TRUCK, 10.2, 6, 2.0)])
+    instance, semantic = scene_instances(*arguments, one_class=False)
+    assert (semantic == arguments[3]).all()
+    assert len(set(instance[semantic != ROAD])) == 1
+
+
 def test_stuff_and_void_get_no_id_and_keep_their_class():
     arguments, boxes = scene([car(8, 6), Box(MANMADE, 20, 6), Box(VOID, -8, 6)])
     instance, semantic = scene_instances(*arguments)
