@@ -20,13 +20,13 @@ from l3ps import project
 from l3ps.costs import CostBook, StageCost
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
-from l3ps.evaluate.estimates import ScanEstimate, estimate_scans
+from l3ps.evaluate.estimates import ScanEstimate, estimate_scene
 from l3ps.labels.types import Provenance, ScanLabels
 from l3ps.presets import Preset
-from l3ps.progress import Progress, silent, track
-from l3ps.refine.cluster import Clusterer, cluster_scene
+from l3ps.progress import Progress, silent
 from l3ps.refine.accumulate import deskew, transform
 from l3ps.refine.chunks import Merger, plan, progress_of
+from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.identify import identify
 from l3ps.refine.poses import Motion, PoseTracker
@@ -219,11 +219,8 @@ def _refine_chunk(
             for labels, part in zip(primal, map(slice, bounds[:-1], bounds[1:]), strict=True)
         ]
         progress("instances", 1, 1)
-        tokens = [labels.token for labels in primal]
-        votes = np.concatenate([labels.semantic for labels in primal])
-        estimates = estimate_scans(tokens, bounds, points, cluster, votes, found.semantic)
 
-    return refined, estimates
+    return refined, estimate_scene(points, cluster, primal, refined)
 
 
 _REMEDY = "Use the primal labels that were made from this log."

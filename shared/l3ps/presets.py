@@ -85,8 +85,11 @@ class Preset:
         object_vote: metres between two objects of a scan that choose one class for all their points; None as published.
         unseen_ground: ground that no camera saw takes the class of the nearest labelled ground within this many metres;
             None leaves it void, as published.
-        instances: ``published`` mends the ids of the images, ``geometry`` takes objects from the points.
+        instances: ``published`` mends the ids of the images, ``geometry`` takes objects from the points of a scan,
+            ``scene`` from those of all scans: one id and one class an object throughout (:mod:`l3ps.refine.objects`).
         instance_gap: metres between two objects of a class, for ``geometry``.
+        instance_class: the points of an object take the class that most of them, over all scans, vote for and that fits
+            its size; for ``scene``.
     """
 
     name: Literal["paper", "best", "fast"]
@@ -101,8 +104,9 @@ class Preset:
     consensus: Consensus | None = None
     object_vote: float | None = None
     unseen_ground: float | None = None
-    instances: Literal["published", "geometry"] = "published"
+    instances: Literal["published", "geometry", "scene"] = "published"
     instance_gap: float = 0.7
+    instance_class: bool = False
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data, for content keys and reports."""
@@ -119,7 +123,8 @@ BEST = replace(
     consensus=Consensus(),
     object_vote=0.5,
     unseen_ground=2.0,
-    instances="geometry",
+    instances="scene",
+    instance_class=True,
 )
 """Objects from geometry gain 10 and more PQ over the published instance step on the recordings with box truth. On
 simulated drives kept for tuning (seeds 21 to 24) the mean gain over primal is 17.7 mIoU and 31.8 thing PQ; without the

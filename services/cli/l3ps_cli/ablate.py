@@ -15,7 +15,8 @@ from rich.table import Table
 from l3ps.drivelog import opened
 from l3ps.drivelog.types import Drive, Scene
 from l3ps.errors import LabelError, Problem
-from l3ps.evaluate import PROTOCOLS, PanopticEvaluator, Quality, evaluate_scene
+from l3ps.evaluate import PROTOCOLS, IdConsistency, PanopticEvaluator, Quality, evaluate_scene, follow_ids
+from l3ps.evaluate.tracking import MIN_SCANS
 from l3ps.labels import ScanLabels
 from l3ps.pipeline import primal_labels, refine_scene
 from l3ps.presets import BEST, PAPER, Preset
@@ -105,7 +106,8 @@ def _one_log(
             refined = [_refined(drive, *pair, row.preset, threads) for pair in zip(scenes, primal, strict=True)]
             seconds = time.perf_counter() - began
             after = _score(drive, scenes, refined, protocol)
-            lines.append({"variant": row.name, **_figures(before, after), "seconds": seconds})
+            ids = sum((follow_ids(drive, *pair) for pair in zip(scenes, refined, strict=True)), IdConsistency())
+            lines.append({"variant": row.name, **_figures(before, after), "ids": ids.as_dict(), "seconds": seconds})
         progress("variants", len(rows), len(rows))
     return {"log": path.name, "scenes": [scene.name for scene in scenes], "rows": lines}
 
@@ -155,12 +157,22 @@ def _figures(before: Quality, after: Quality) -> dict[str, Any]:
 def _table(result: dict[str, Any], protocol: str) -> Table:
     table = Table(title=f"{result['log']}, protocol {protocol}, per cent", title_justify="left")
     table.add_column("variant", no_wrap=True)
-    for column in ("PQ", "PQ\nthings", "mIoU", "worst class,\nIoU to primal", "s"):
+    for column in ("PQ", "PQ\nthings", "mIoU", "one\nid", "worst\nIoU"):
         table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("of class")
+    table.caption, table.caption_justify = (
+        (
+            f"one id: objects seen in {MIN_SCANS} scans or more that keep one id, of those matched twice.\n"
+            "worst IoU: the largest loss of a class against the primal labels."
+        ),
+        "left",
+    )
     for row in result["rows"]:
-        worst = "" if row["worst_class"] is None else f"{row['worst_class']} {row['worst_iou_change']:+.1f}"
-        figures = [row["pq"], row["pq_things"], row["miou"]]
-        cells = ["" if value is None else f"{value:.1f}" for value in figures]
-        seconds = "" if row["seconds"] is None else f"{row['seconds']:.1f}"
-        table.add_row(row["variant"], *cells, worst, seconds)
+        one_id = row.get("ids", {}).get("one_id")
+        cells = [_number(value) for value in (row["pq"], row["pq_things"], row["miou"], one_id)]
+        table.add_row(row["variant"], *cells, _number(row["worst_iou_change"], "+"), row["worst_class"] or "")
     return table
+
+
+def _number(value: float | None, sign: str = "") -> str:
+    return "" if value is None else f"{value:{sign}.1f}"

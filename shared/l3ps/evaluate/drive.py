@@ -14,6 +14,7 @@ from l3ps.errors import LabelError, Problem
 from l3ps.evaluate.evaluator import PanopticEvaluator
 from l3ps.evaluate.protocols import Protocol, protocol_named
 from l3ps.evaluate.quality import Quality
+from l3ps.evaluate.tracking import IdConsistency, id_consistency
 from l3ps.labels.reader import LabelFolder, open_labels, wrong_count
 from l3ps.labels.spaces import convert
 from l3ps.labels.types import ScanLabels
@@ -93,6 +94,21 @@ def evaluate_scene(drive: Drive, scene: Scene, labels: Sequence[ScanLabels], pro
             semantic, instance = convert(scan_labels.semantic, instance, NUSCENES16.name, rules.space.name)
             _add(evaluator, scan, _truth_in(drive, rules, scan), semantic, instance)
     return evaluator
+
+
+def follow_ids(drive: Drive, scene: Scene, labels: Sequence[ScanLabels]) -> IdConsistency:
+    """How well ids follow the objects through a scene; scans without true instances are passed over.
+
+    Args:
+        drive: the log the scene is from.
+        scene: the scene.
+        labels: labels of its scans.
+    """
+    rules = protocol_named(NUSCENES16.name)
+    scans = {scan.token: scan for scan in scene.scans if scan.load_truth is not None}
+    pairs = [(_truth_in(drive, rules, scans[of.token]), of) for of in labels if of.token in scans]
+    pairs = [(truth, of) for truth, of in pairs if truth.has_instances]
+    return id_consistency([truth for truth, _ in pairs], [of for _, of in pairs])
 
 
 def _truth_in(drive: Drive, rules: Protocol, scan: Scan) -> Truth:

@@ -25,10 +25,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from l3ps.labels.types import ScanLabels
 from l3ps.taxonomy import NUSCENES16, VOID
 
 CELL = 0.3
@@ -71,6 +73,41 @@ class ScanEstimate:
     def as_dict(self) -> dict[str, str | float | None]:
         """Plain data, for JSON."""
         return asdict(self)
+
+
+def estimate_scene(
+    points: NDArray[np.float32],
+    cluster: NDArray[np.int32],
+    primal: Sequence[ScanLabels],
+    refined: Sequence[ScanLabels],
+) -> list[ScanEstimate]:
+    """:func:`estimate_scans` of labels as they come out of the refinement.
+
+    Args:
+        points: (N, 3) float32, metres, scene frame.
+        cluster: (N,) int32 cluster, -1 for none.
+        primal: the labels before the vote, scan by scan.
+        refined: those after it.
+    """
+
+    def joined(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:
+        known = [part for part in parts if part is not None]
+        return np.concatenate(known) if known and len(known) == len(parts) else None
+
+    before, after = joined([s.semantic for s in primal]), joined([s.semantic for s in refined])
+    if before is None or after is None:
+        return []
+    seen = [s.evidence and seen_twice(s.evidence.cameras, s.evidence.agree) for s in primal]
+    return estimate_scans(
+        [s.token for s in refined],
+        np.cumsum([0, *(len(s.semantic) for s in refined)]),
+        points,
+        cluster,
+        before,
+        after,
+        joined(seen),
+        joined([s.confidence for s in refined]),
+    )
 
 
 def estimate_scans(

@@ -55,7 +55,9 @@ def identify(
     """
     if preset.instances == "scene":
         before = np.concatenate([labels.semantic for labels in primal])
-        instance, semantic = scene_instances(points, bounds, ground, semantic, before, poses[:, :3, 3], times)
+        instance, semantic = scene_instances(
+            points, bounds, ground, semantic, before, poses[:, :3, 3], times, one_class=preset.instance_class
+        )
         return Objects(semantic, instance)
     instance = np.zeros(len(points), dtype=np.int32)
     for labels, part in zip(primal, map(slice, bounds[:-1], bounds[1:]), strict=True):

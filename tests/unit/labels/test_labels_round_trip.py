@@ -128,11 +128,24 @@ def test_more_objects_than_the_format_can_number_is_an_error_that_leaves_nothing
     from l3ps.errors import LabelError
 
     scene = make_scene("long", ["a", "b"])
-    labels = [
-        ScanLabels(t, np.full(500, 4, np.uint8), np.arange(500, dtype=np.int32) + k) for t, k in (("a", 1), ("b", 501))
-    ]
+    labels = [ScanLabels(t, np.full(1000, 4, np.uint8), np.arange(1, 1001, dtype=np.int32)) for t in "ab"]
     with pytest.raises(LabelError, match=r"scene long: has 1,000 instances of car, the label format holds 999"):
         write_scene(tmp_path, "nuscenes", scene, labels)
     assert list(tmp_path.rglob("*")) == []
-    labels[1].instance[0] = 1
+    for scan in labels:
+        scan.instance[0] = 2
     assert len(write_scene(tmp_path, "nuscenes", scene, labels)) == 4
+
+
+def test_where_numbers_run_out_only_objects_of_one_scan_share_them(make_scene, tmp_path):
+    """A scene has more objects than the format numbers, but no scan has: those seen again keep their own."""
+    scene = make_scene("long", ["a", "b", "c"])
+    of_scan = [[*range(1, 301), *range(1000 * k, 1000 * k + 400)] for k in (1, 2, 3)]
+    labels = [
+        ScanLabels(t, np.full(700, 4, np.uint8), np.array(ids, np.int32)) for t, ids in zip("abc", of_scan, strict=True)
+    ]
+    write_scene(tmp_path, "nuscenes", scene, labels)
+    written = [np.load(tmp_path / f"panoptic/{t}_panoptic.npz")["data"] - 4000 for t in "abc"]
+    assert all(len(set(ids.tolist())) == 700 and ids.max() <= 999 for ids in written)
+    assert all((ids[:300] == written[0][:300]).all() for ids in written)
+    assert not set(written[0][:300].tolist()) & set(written[1][300:].tolist())
