@@ -97,7 +97,7 @@ def estimate_scene(
     before, after = joined([s.semantic for s in primal]), joined([s.semantic for s in refined])
     if before is None or after is None:
         return []
-    seen = [s.evidence and seen_twice(s.evidence.cameras, s.evidence.agree) for s in primal]
+    seen = [None if s.evidence is None else seen_twice(s.evidence.cameras, s.evidence.agree) for s in primal]
     return estimate_scans(
         [s.token for s in refined],
         np.cumsum([0, *(len(s.semantic) for s in refined)]),
