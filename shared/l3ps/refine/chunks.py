@@ -127,7 +127,10 @@ class Merger:
 
 
 def shared_points(known: Sequence[ScanLabels], labels: Sequence[ScanLabels]) -> list[tuple[int, int, int, int]]:
-    """Pairs of ids that name the same points with the same class, the largest first.
+    """Pairs of ids that name the same points, the largest first.
+
+    Their classes need not agree: chunks may judge one object differently. Asked for one class, 0.78 and 0.54 of the
+    objects of a simulated drive kept their id over its two seams; not asked, 0.85 and 0.58 (without seams 0.93, 0.67).
 
     Args:
         known: labels of some scans.
@@ -136,10 +139,9 @@ def shared_points(known: Sequence[ScanLabels], labels: Sequence[ScanLabels]) -> 
     Returns:
         (id in ``known``, id in ``labels``, points in common, points that the smaller of the two has).
     """
-    pairs = []
+    pairs: list[NDArray[np.int64]] = []
     for one, other in zip(known, labels, strict=False):
-        same = (one.semantic == other.semantic) | (one.instance == 0) | (other.instance == 0)
-        pairs.append((np.where(same, one.instance, 0).astype(np.int64) << 32) | np.where(same, other.instance, 0))
+        pairs.append((one.instance.astype(np.int64) << 32) | other.instance)
     if not pairs:
         return []
     found, count = np.unique(np.concatenate(pairs), return_counts=True)

@@ -70,10 +70,15 @@ def test_two_objects_never_become_one_by_the_seam():
     assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 1, 2, 2]]
 
 
-def test_objects_of_different_classes_are_different():
-    first, second = [labels("a", [1, 1])], [labels("a", [1, 1], semantic=7)]
-    assert shared_points(first, second) == []
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[2, 2]]
+def test_an_object_keeps_its_id_where_chunks_judge_its_class_differently():
+    first, second = [labels("a", [1, 1, 2])], [labels("a", [2, 2, 1], semantic=7)]
+    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 2]]
+
+
+def test_ids_that_share_few_points_are_different():
+    first, second = [labels("a", [1, 1, 1, 0, 0, 0])], [labels("a", [0, 0, 1, 1, 1, 1])]
+    assert shared_points(first, second) == [(1, 1, 1, 3)]
+    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[0, 0, 2, 2, 2, 2]]
 
 
 def test_one_chunk_comes_out_as_it_went_in():
