@@ -26,6 +26,10 @@ View = tuple[PanopticImage, NDArray[np.float64], NDArray[np.float64]]
 class Weighing:
     """How much a camera's word on a point counts.
 
+    Measured as in :class:`l3ps.presets.Consensus`, where all together gain 17.7 mIoU and 31.8 thing PQ: without the
+    occlusion test 17.1 and 30.2, without the edges 17.6 and 30.5, all depths alike 16.1 and 30.4, by label alone 17.0
+    and 30.5, by probability alone 18.3 and 33.9 (but real recordings then lose a bus of few points and 2 IoU of cars).
+
     Attributes:
         occlusion: a point this share of its depth (and 0.5 m) behind the surface above and below it in the image gets
             no vote from that camera; None lets all vote, as published.

@@ -5,7 +5,7 @@ piece of wall is a wall. Here each level is believed as far as it has evidence, 
 coarser one: the cluster's opinion counts as ``neighbours`` votes among those of a half-metre cell, the cell's as
 ``own`` votes beside those of the point itself (a hierarchical Dirichlet prior, MacKay and Peto 1995).
 
-    cluster, or 4 m of level ground ──▶ cell of 0.5 m ──▶ point
+    cluster, or 3 m of level ground ──▶ cell of 0.5 m ──▶ point
 
 Ground has no clusters worth the name: HDBSCAN joins carriageway and pavement. Wide squares take their place, parted
 where the height changes: a kerb is what tells one from the other.
