@@ -78,10 +78,12 @@ def test_one_cluster_of_ground_can_be_road_here_and_sidewalk_there(rng):
 
 def test_ground_that_few_cameras_saw_goes_by_its_level_not_by_what_lies_beside_it(rng):
     """A kerb of 15 cm in the middle of a square; of the pavement only a strip was seen."""
-    road, walk = box(rng, (0, 0, 0), (2, 4, 0.02), 3000), box(rng, (2, 0, 0.16), (4, 4, 0.18), 3000)
+    wide = RULES.square
+    road = box(rng, (0, 0, 0), (wide / 2, wide, 0.02), 3000)
+    walk = box(rng, (wide / 2, 0, 0.16), (wide, wide, 0.18), 3000)
     points = np.concatenate([road, walk])
     semantic = np.repeat([ROAD, SIDEWALK], 3000)
-    seen = (points[:, 0] < 2) | (points[:, 1] < 0.5)
+    seen = (points[:, 0] < wide / 2) | (points[:, 1] < 0.5)
     found = classes(points, np.where(seen, semantic, VOID), ground=True).semantic
     np.testing.assert_array_equal(found, semantic)
 
