@@ -21,7 +21,7 @@ from l3ps.costs import CostBook, StageCost
 from l3ps.drivelog.types import Scan, Scene
 from l3ps.errors import LabelError, Problem
 from l3ps.evaluate.estimates import ScanEstimate, estimate_scene
-from l3ps.labels.types import Provenance, ScanLabels
+from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent
 from l3ps.refine.accumulate import deskew, transform
@@ -30,7 +30,7 @@ from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.identify import identify
 from l3ps.refine.poses import Motion, PoseTracker
-from l3ps.refine.verdict import decide
+from l3ps.refine.verdict import decide, of_objects
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
@@ -189,7 +189,7 @@ def _refine_chunk(
         ground = np.concatenate(grounds)
 
     with book.span("cluster"):
-        cluster = cluster_scene(
+        cluster, noise = cluster_scene(
             points,
             ground,
             preset.min_cluster_size,
@@ -201,20 +201,20 @@ def _refine_chunk(
         progress("cluster", 1, 1)
 
     with book.span("vote"):
-        verdict = decide(points, ground, cluster, bounds, primal, preset, threads)
+        verdict = decide(points, ground, cluster, noise, primal, preset)
         progress("vote", 1, 1)
 
     with book.span("instances"):
         times = np.array([scan.timestamp for scan in scans]) / 1e6
         found = identify(points, bounds, ground, verdict.semantic, primal, motion.poses, times, preset)
-        verdict.provenance[found.semantic != verdict.semantic] = Provenance.INSTANCE_RULE
+        settled = of_objects(verdict, found)
         refined = [
             ScanLabels(
                 labels.token,
-                found.semantic[part],
+                settled.semantic[part],
                 found.instance[part],
-                confidence=verdict.confidence[part],
-                provenance=verdict.provenance[part],
+                confidence=settled.confidence[part],
+                provenance=settled.provenance[part],
             )
             for labels, part in zip(primal, map(slice, bounds[:-1], bounds[1:]), strict=True)
         ]

@@ -82,9 +82,6 @@ class Preset:
         voting: see :class:`Voting`.
         evidence: cameras vote with their class probabilities; False takes each primal label for one vote, as published.
         consensus: see :class:`Consensus`; None lets the cluster alone decide, as published.
-        object_vote: metres between two objects of a scan that choose one class for all their points; None as published.
-        unseen_ground: ground that no camera saw takes the class of the nearest labelled ground within this many metres;
-            None leaves it void, as published.
         instances: ``published`` mends the ids of the images, ``geometry`` takes objects from the points of a scan,
             ``scene`` from those of all scans: one id and one class an object throughout (:mod:`l3ps.refine.objects`).
         instance_gap: metres between two objects of a class, for ``geometry``.
@@ -102,8 +99,6 @@ class Preset:
     voting: Voting = Voting()
     evidence: bool = False
     consensus: Consensus | None = None
-    object_vote: float | None = None
-    unseen_ground: float | None = None
     instances: Literal["published", "geometry", "scene"] = "published"
     instance_gap: float = 0.7
     instance_class: bool = False
@@ -121,8 +116,6 @@ BEST = replace(
     poses="log",
     evidence=True,
     consensus=Consensus(),
-    object_vote=0.5,
-    unseen_ground=2.0,
     instances="scene",
     instance_class=True,
 )

@@ -14,6 +14,6 @@ three functions run on SciPy. To build it after the fact: ``uv sync --reinstall-
 
 from l3ps_cluster.hdbscan import HDBSCAN
 from l3ps_cluster.neighbours import fill_noise, link, nearest
-from l3ps_cluster.points import native
+from l3ps_cluster.points import build, native
 
-__all__ = ["HDBSCAN", "fill_noise", "link", "native", "nearest"]
+__all__ = ["HDBSCAN", "build", "fill_noise", "link", "native", "nearest"]

@@ -14,6 +14,7 @@ from typing import Any
 
 import l3ps
 from l3ps.presets import Preset
+from l3ps.refine.cluster import build
 
 _ROOT = Path(l3ps.__path__[0])
 _SEGMENTATION = ("segment", "drivelog", "project.py", "geometry.py", "taxonomy.py", "pipeline.py", "labels/types.py")
@@ -51,11 +52,15 @@ def refine_key(
 
 @cache
 def code_version(parts: tuple[str, ...] = ()) -> str:
-    """A digest of the method's source: the given files and folders of ``l3ps``, or all that decides labels."""
-    files = [path for path in _ROOT.rglob("*.py") if _covered(path.relative_to(_ROOT).as_posix(), parts)]
+    """A digest of the method's source: the given files and folders of ``l3ps``, or all that decides labels.
+
+    All of it covers the build of the clustering too: the package that stands in for it decides ties otherwise.
+    """
     digest = hashlib.sha256()
-    for path in sorted(files):
+    for path in sorted(path for path in _ROOT.rglob("*.py") if _covered(path.relative_to(_ROOT).as_posix(), parts)):
         digest.update(path.relative_to(_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    if not parts:
+        digest.update(build().encode())
     return digest.hexdigest()
 
 

@@ -49,6 +49,11 @@ def _warn_of_the_slow_way() -> None:
     )
 
 
+def build() -> str:
+    """What clusters here, for content keys: labels of another build may differ where distances tie."""
+    return l3ps_cluster.build()
+
+
 def hdbscan_package(points: NDArray[np.float32], min_cluster_size: int, threads: int) -> NDArray[np.int32]:
     """HDBSCAN of the ``hdbscan`` package: Euclidean, min_samples = min_cluster_size, excess of mass.
 
@@ -73,7 +78,7 @@ def cluster_scene(
     voxel: float | None = None,
     clusterer: Clusterer | None = None,
     cancel: Callable[[], None] | None = None,
-) -> NDArray[np.int32]:
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Cluster ground and non-ground points apart from each other.
 
     Args:
@@ -88,11 +93,13 @@ def cluster_scene(
 
     Returns:
         (N,) int32 cluster ids from 0, unique over both partitions. Points that are not finite keep -1, as do those of
-        a partition in which no cluster was found: nothing groups them.
+        a partition in which no cluster was found: nothing groups them. And (N,) bool, which points HDBSCAN left out as
+        noise and their neighbours' clusters took in.
     """
     if clusterer is None:
         clusterer = functools.partial(exact_hdbscan, cancel=cancel)
     labels = np.full(len(points), NOISE, dtype=np.int32)
+    noise = np.zeros(len(points), dtype=bool)
     first_free = 0
     finite = np.isfinite(points).all(axis=1)
     for partition in (~ground, ground):
@@ -101,11 +108,14 @@ def cluster_scene(
             continue
         own = points[members]
         seeds, cell = (own, None) if voxel is None else _centroids(own, voxel)
-        found = reassign_noise(seeds, clusterer(seeds, min_cluster_size, threads), threads)
-        found = found if cell is None else found[cell]
+        sure = clusterer(seeds, min_cluster_size, threads)
+        found = reassign_noise(seeds, sure, threads)
+        if cell is not None:
+            sure, found = sure[cell], found[cell]
+        noise[members] = (sure == NOISE) & (found != NOISE)
         labels[members] = np.where(found == NOISE, NOISE, found + first_free)
         first_free += int(found.max()) + 1
-    return labels
+    return labels, noise
 
 
 def reassign_noise(points: NDArray[np.float32], labels: NDArray[np.int32], threads: int = 2) -> NDArray[np.int32]:

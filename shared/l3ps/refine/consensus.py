@@ -35,17 +35,11 @@ class Opinion:
         semantic: (N,) uint8 class; void where there is no evidence on any level.
         share: (N,) float32 in 0..1, the winner's share of all votes, those for void and for what the partition rules
             out included.
-        cell: (N,) int32 cell of each point.
-        belief: (U, 17) float32, per cell the share of each class; rows add up to 1 at most.
-        counted: the evidence as it was counted: without void and by the partition.
         heard: (N,) bool, whether the most of the cell's own votes are for the class.
     """
 
     semantic: NDArray[np.uint8]
     share: NDArray[np.float32]
-    cell: NDArray[np.int32]
-    belief: NDArray[np.float32]
-    counted: Evidence
     heard: NDArray[np.bool_]
 
 
@@ -82,7 +76,7 @@ def by_consensus(
     del of_group, of_cell
 
     semantic, share = _settle(cell, belief, counted, evidence, rules)
-    return Opinion(semantic, share, cell, belief, counted, heard[cell] == semantic)
+    return Opinion(semantic, share, heard[cell] == semantic)
 
 
 _DOUBT = 0.5

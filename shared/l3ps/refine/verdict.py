@@ -12,8 +12,8 @@ from l3ps.labels.types import Evidence, Provenance, ScanLabels
 from l3ps.presets import Preset
 from l3ps.refine.confidence import as_confidence, cluster_share
 from l3ps.refine.consensus import by_consensus
-from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
-from l3ps.refine.vote import fill_unseen_ground, vote
+from l3ps.refine.identify import Objects
+from l3ps.refine.vote import vote
 from l3ps.taxonomy import NUSCENES16, VOID
 
 
@@ -36,11 +36,9 @@ def decide(
     points: NDArray[np.float32],
     ground: NDArray[np.bool_],
     cluster: NDArray[np.int32],
-    bounds: NDArray[np.integer],
+    noise: NDArray[np.bool_],
     primal: Sequence[ScanLabels],
     preset: Preset,
-    threads: int = 2,
-    noise: NDArray[np.bool_] | None = None,
 ) -> Verdict:
     """Choose the class of every point of a scene.
 
@@ -48,11 +46,9 @@ def decide(
         points: (N, 3) float32, metres, scene frame, z up.
         ground: (N,) bool partition.
         cluster: (N,) int32 ids from 0, -1 for points of no cluster.
-        bounds: (S + 1,) where each scan begins among the points, and N.
+        noise: (N,) bool, points that HDBSCAN left out and that were given to a cluster afterwards.
         primal: the primal labels, scan by scan.
         preset: which rules.
-        threads: threads of the neighbour search.
-        noise: (N,) bool, points that HDBSCAN left out and that were given to a cluster afterwards; None if unknown.
 
     Returns:
         The verdict on each point.
@@ -70,20 +66,32 @@ def decide(
         provenance[semantic == before] = Provenance.CAMERA
         ruled_out = (before != VOID) & (NUSCENES16.is_ground[before] != ground)
         provenance[ruled_out & (semantic != before)] = Provenance.GROUND_RULE
-        if preset.object_vote is not None:
-            found = objects_of_a_kind(points, bounds, semantic, preset.object_vote)
-            chosen, share = vote_by_object(found, opinion, preset.consensus.own)
-            provenance[chosen != semantic] = Provenance.INSTANCE_RULE
-            semantic = chosen
-    if preset.unseen_ground is not None:
-        semantic, source = fill_unseen_ground(points, ground, semantic, preset.unseen_ground, threads)
-        filled = source >= 0
-        share[filled] = share[source[filled]]
-        provenance[filled] = Provenance.GROUND_RULE
-    if noise is not None:
-        provenance[noise & (provenance == Provenance.CLUSTER)] = Provenance.NOISE_FILL
+    provenance[noise & (provenance == Provenance.CLUSTER)] = Provenance.NOISE_FILL
     provenance[semantic == VOID] = Provenance.NONE
     return Verdict(semantic, as_confidence(share, semantic), provenance)
+
+
+def of_objects(verdict: Verdict, objects: Objects) -> Verdict:
+    """The verdict after the objects had their say.
+
+    A point whose class its object changed is as sure as the object is of one mind: its confidence becomes the share of
+    the object's points, in all scans, that had this class before.
+
+    Args:
+        verdict: on each point after the vote.
+        objects: of the scene.
+    """
+    semantic, of = objects.semantic, objects.instance
+    changed = np.flatnonzero(semantic != verdict.semantic)
+    if len(changed) == 0:
+        return verdict
+    points = np.bincount(of)
+    agreeing = np.bincount(of, weights=semantic == verdict.semantic)
+    confidence, provenance = verdict.confidence.copy(), verdict.provenance.copy()
+    share = (agreeing / np.maximum(points, 1))[of[changed]]
+    confidence[changed] = as_confidence(share.astype(np.float32), semantic[changed])
+    provenance[changed] = Provenance.INSTANCE_RULE
+    return Verdict(semantic, confidence, provenance)
 
 
 def _evidence(primal: Sequence[ScanLabels], wanted: bool) -> Evidence:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from l3ps.presets import Voting
 from l3ps.refine.cluster import NOISE
@@ -57,38 +56,3 @@ def winners(counts: NDArray[np.int64], voting: Voting) -> NDArray[np.uint8]:
         winner[hit] = rare
         open_to_rare &= ~hit
     return winner.astype(np.uint8)
-
-
-def fill_unseen_ground(
-    points: NDArray[np.float32],
-    ground: NDArray[np.bool_],
-    semantic: NDArray[np.uint8],
-    reach: float,
-    threads: int = 2,
-) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Give void ground points the class of the nearest point that is ground by partition and by label.
-
-    The ground next to the vehicle lies below every camera's view: on nuScenes no camera sees it up to 5 m, which is a
-    third of the ground's points. Its clusters hold no vote.
-
-    Args:
-        points: (N, 3) float32, metres, scene frame.
-        ground: (N,) bool partition.
-        semantic: (N,) uint8 class after the vote.
-        reach: metres beyond which a point stays void.
-        threads: threads of the neighbour search.
-
-    Returns:
-        (N,) uint8 class, and (N,) int32 the point each filled point took its class from, -1 for all others.
-    """
-    finite = np.isfinite(points).all(axis=1)
-    known = np.flatnonzero(finite & ground & NUSCENES16.is_ground[semantic])
-    unseen = np.flatnonzero(finite & ground & (semantic == VOID))
-    filled, source = semantic.copy(), np.full(len(points), -1, dtype=np.int32)
-    if len(known) and len(unseen):
-        tree = cKDTree(points[known])
-        distance, nearest = tree.query(points[unseen], distance_upper_bound=reach, workers=threads)
-        near = np.isfinite(distance)
-        source[unseen[near]] = known[nearest[near]]
-        filled[unseen[near]] = semantic[source[unseen[near]]]
-    return filled, source

@@ -20,7 +20,7 @@ rng = np.random.default_rng(5)
 points = np.concatenate([rng.normal(c, 0.3, (60, 3)) for c in ((0, 0, 0), (9, 0, 0), (0, 9, 0))]).astype(np.float32)
 with warnings.catch_warnings(record=True) as warned:
     warnings.simplefilter("always")
-    labels = [cluster_scene(points, points[:, 0] > 5, 5) for _ in range(2)]
+    labels = [cluster_scene(points, points[:, 0] > 5, 5)[0] for _ in range(2)]
 try:
     l3ps_cluster.HDBSCAN().fit(points)
     error = ""
@@ -51,7 +51,7 @@ def test_everything_works_without_the_compiled_part():
     assert "C++ compiler" in slow["warned"][0]
     assert "uv sync --reinstall-package l3ps-cluster" in slow["error"]
 
-    package = cluster_scene(points, points[:, 0] > 5, 5, clusterer=hdbscan_package)
+    package = cluster_scene(points, points[:, 0] > 5, 5, clusterer=hdbscan_package)[0]
     assert slow["labels"] == [package.tolist()] * 2
 
     distance, index = nearest(points, points[::7] + 0.1, 3, max_distance=0.5)

@@ -13,7 +13,7 @@ def blob(rng, centre, count=60, spread=0.2):
 
 def test_distant_blobs_are_clusters_of_their_own_and_nothing_is_noise(rng):
     points = np.concatenate([blob(rng, (0, 0, 0)), blob(rng, (20, 0, 0)), blob(rng, (0, 20, 0))])
-    labels = cluster_scene(points, np.zeros(180, bool), 5)
+    labels, _ = cluster_scene(points, np.zeros(180, bool), 5)
     groups = [set(labels[i : i + 60]) for i in (0, 60, 120)]
     assert NOISE not in labels
     assert not groups[0] & groups[1]
@@ -23,18 +23,18 @@ def test_distant_blobs_are_clusters_of_their_own_and_nothing_is_noise(rng):
 def test_ground_and_object_never_share_a_cluster_even_where_they_touch(rng):
     points = np.concatenate([blob(rng, (0, 0, 0), 200), blob(rng, (0, 0, 0), 200)])
     ground = np.repeat([True, False], 200)
-    labels = cluster_scene(points, ground, 5)
+    labels, _ = cluster_scene(points, ground, 5)
     assert not set(labels[ground]) & set(labels[~ground])
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 6])
 def test_tiny_partitions_are_left_alone_or_clustered_but_never_fail(rng, count):
-    labels = cluster_scene(blob(rng, (0, 0, 0), count), np.zeros(count, bool), 5)
+    labels, _ = cluster_scene(blob(rng, (0, 0, 0), count), np.zeros(count, bool), 5)
     assert labels.shape == (count,)
 
 
 def test_identical_points_do_not_fail():
-    labels = cluster_scene(np.zeros((50, 3), np.float32), np.zeros(50, bool), 5)
+    labels, _ = cluster_scene(np.zeros((50, 3), np.float32), np.zeros(50, bool), 5)
     assert len(set(labels)) == 1
 
 
@@ -56,7 +56,7 @@ def test_all_noise_stays_noise():
 
 def test_cells_stand_for_their_points(rng):
     points = np.concatenate([blob(rng, (0, 0, 0), 500), blob(rng, (30, 0, 0), 500)])
-    labels = cluster_scene(points, np.zeros(1000, bool), 5, voxel=0.1)
+    labels, _ = cluster_scene(points, np.zeros(1000, bool), 5, voxel=0.1)
     assert not set(labels[:500]) & set(labels[500:])
 
 
@@ -76,8 +76,8 @@ def test_the_core_clusters_unless_another_is_asked_for(rng):
         return np.zeros(len(part), np.int32)
 
     ground = points[:, 2] < 0
-    assert (cluster_scene(points, ground, 5) == cluster_scene(points, ground, 5, clusterer=exact_hdbscan)).all()
-    assert (cluster_scene(points, ground, 5, threads=3, clusterer=one_cluster) == ground).all()
+    assert (cluster_scene(points, ground, 5)[0] == cluster_scene(points, ground, 5, clusterer=exact_hdbscan)[0]).all()
+    assert (cluster_scene(points, ground, 5, threads=3, clusterer=one_cluster)[0] == ground).all()
     assert asked == [((~ground).sum(), 5, 3), (ground.sum(), 5, 3)]
 
 

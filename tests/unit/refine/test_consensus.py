@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from l3ps.labels.types import Evidence
 from l3ps.presets import Consensus
 from l3ps.refine.consensus import by_consensus
-from l3ps.refine.object_class import objects_of_a_kind, vote_by_object
 
 VOID, BICYCLE, BUS, CAR, PEDESTRIAN, TRAILER, TRUCK, ROAD, SIDEWALK, MANMADE = 0, 2, 3, 4, 7, 9, 10, 11, 13, 15
 RULES = Consensus()
@@ -147,51 +146,3 @@ def test_the_order_of_the_points_does_not_matter(rng):
     order = rng.permutation(600)
     again = classes(points[order], semantic[order], ground=ground[order], cluster=cluster[order]).semantic
     np.testing.assert_array_equal(again, first[order])
-
-
-def objects(points, semantic, bounds=None, cluster=None):
-    opinion = classes(points, semantic, cluster=np.arange(len(points)) if cluster is None else cluster)
-    bounds = np.array([0, len(points)] if bounds is None else bounds)
-    return vote_by_object(objects_of_a_kind(points, bounds, opinion.semantic, 0.5), opinion, RULES.own)
-
-
-def test_a_bus_that_is_truck_at_one_end_is_a_bus(rng):
-    points = box(rng, (0, 0, 0), (11, 2.5, 3), 4000)
-    semantic, share = objects(points, np.where(points[:, 0] < 4, TRUCK, BUS))
-    assert (semantic == BUS).all()
-    assert (share < 0.95).all(), "it is less sure than a bus that all agree on"
-    assert (objects(points, np.full(4000, BUS))[1] > 0.95).all()
-
-
-def test_two_vehicles_apart_choose_apart(rng):
-    points = np.concatenate([box(rng, (0, 0, 0), (4, 2, 1.5), 800), box(rng, (5, 0, 0), (15, 2.5, 3), 800)])
-    semantic = np.repeat([CAR, BUS], 800)
-    np.testing.assert_array_equal(objects(points, semantic)[0], semantic)
-
-
-def test_an_object_of_many_opinions_stays_of_its_kind(rng):
-    """Four parts that are four vehicles to the network, and all of them second a bicycle: it is no bicycle."""
-    part = np.repeat(np.arange(4), 100)
-    points = np.column_stack([part + rng.random(400), rng.random(400), np.zeros(400)]).astype(np.float32)
-    ballot = np.array([[CAR, BICYCLE, 0], [TRUCK, BICYCLE, 0], [BUS, BICYCLE, 0], [TRAILER, BICYCLE, 0]], np.uint8)
-    weights = np.array([[70, 30, 0], [70, 30, 0], [52, 48, 0], [52, 48, 0]], np.uint8)
-    seen = Evidence(ballot[part], weights[part], np.ones(400, np.uint8), np.ones(400, bool))
-    opinion = classes(points, [], cluster=part, evidence=seen)
-    assert BICYCLE not in opinion.semantic
-    (winner,) = set(vote_by_object(np.ones(400, np.int32), opinion, RULES.own)[0].tolist())
-    assert winner in {CAR, TRUCK, BUS, TRAILER}
-
-
-@pytest.mark.parametrize("other", [PEDESTRIAN, MANMADE, ROAD])
-def test_an_object_never_takes_another_kind(rng, other):
-    points = box(rng, (0, 0, 0), (3, 3, 2), 900)
-    semantic = np.where(points[:, 0] < 0.6, other, CAR)
-    found = objects(points, semantic)[0]
-    assert set(found[found != CAR]) == {other}
-
-
-def test_objects_of_different_scans_do_not_vote_together(rng):
-    points = np.concatenate([box(rng, (0, 0, 0), (4, 2, 2), 900), box(rng, (0.4, 0, 5), (4.4, 2, 7), 100)])
-    semantic = np.repeat([TRUCK, CAR], [900, 100])
-    assert (objects(points, semantic, bounds=[0, 900, 1000])[0][900:] == CAR).all()
-    assert (objects(points, semantic)[0] == TRUCK).all(), "in one scan they are one object"

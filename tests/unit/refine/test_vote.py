@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l3ps.presets import Voting
-from l3ps.refine.vote import fill_unseen_ground, vote
+from l3ps.refine.vote import vote
 
 VOID, BUS, CAR, MOTORCYCLE, ROAD, VEGETATION = 0, 3, 4, 6, 11, 16
 PUBLISHED = Voting()
@@ -52,25 +52,3 @@ def test_every_cluster_ends_with_one_class_that_one_of_its_points_had(pairs):
         won = np.unique(refined[cluster == c])
         assert len(won) == 1
         assert won[0] in semantic[cluster == c]
-
-
-def test_unseen_ground_takes_the_nearest_ground_class_within_reach():
-    x = [0, 1, 1.5, 4, 10, 1]
-    points = np.column_stack([x, np.zeros(6), np.zeros(6)]).astype(np.float32)
-    semantic = np.array([ROAD, VOID, CAR, VOID, VOID, VOID], np.uint8)
-    ground = np.array([True, True, True, True, True, False])
-    filled, source = fill_unseen_ground(points, ground, semantic, reach=5.0)
-    assert filled.tolist() == [ROAD, ROAD, CAR, ROAD, VOID, VOID], "not the car's class, not too far, ground only"
-    assert source.tolist() == [-1, 0, -1, 0, -1, -1]
-
-
-def test_without_labelled_ground_nothing_is_filled():
-    semantic = np.array([CAR, VOID], np.uint8)
-    filled, _ = fill_unseen_ground(np.zeros((2, 3), np.float32), np.ones(2, bool), semantic, reach=5.0)
-    assert filled.tolist() == [CAR, VOID]
-
-
-def test_lost_returns_are_never_filled():
-    points = np.array([[0, 0, 0], [np.nan, 0, 0]], np.float32)
-    filled, _ = fill_unseen_ground(points, np.ones(2, bool), np.array([ROAD, VOID], np.uint8), reach=np.inf)
-    assert filled.tolist() == [ROAD, VOID]

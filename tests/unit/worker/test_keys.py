@@ -85,3 +85,12 @@ def test_a_changed_vote_rule_refines_anew_from_the_same_primal_labels(
 def test_chunks_give_labels_of_their_own_but_a_budget_that_is_not_reached_does_not() -> None:
     assert refine(max_points=1000) != refine(max_points=2000) != refine()
     assert refine(max_points=None) == refine()
+
+
+def test_labels_of_another_build_of_the_clustering_are_other_labels(monkeypatch) -> None:
+    before, primal = refine(), segment()
+    monkeypatch.setattr(keys, "build", lambda: "another")
+    keys.code_version.cache_clear()
+    assert refine() != before
+    assert segment() == primal, "images know no clusters"
+    keys.code_version.cache_clear()
