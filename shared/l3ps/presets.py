@@ -119,11 +119,7 @@ BEST = replace(
     instances="scene",
     instance_class=True,
 )
-"""Objects from geometry gain 10 and more PQ over the published instance step on the recordings with box truth. On
-simulated drives kept for tuning (seeds 21 to 24) the mean gain over primal is 17.7 mIoU and 31.8 thing PQ; without the
-object vote 14.6 and 24.6, without evidence 14.9 and 27.6. Gaps of 0.3 to 0.7 m between objects are equal. Unseen
-ground, which wide squares mostly reach, adds up to 6 IoU to the driveable surface and takes as much from other flat on
-one drive: 0.2 mIoU less, but the ground is labelled."""
+"""Every part measured: docs/refinement.md. The defaults of :class:`Consensus` are its values."""
 FAST = replace(BEST, name="fast", voxel=0.2)
 """Clusters cell centroids instead of points."""
 
