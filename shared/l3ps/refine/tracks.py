@@ -75,10 +75,12 @@ class Tracks:
     Attributes:
         of: (K,) track.
         moves: (T,) whether a track moves in most of its scans.
+        moving: (K,) whether the cell's track moved in that scan.
     """
 
     of: NDArray[np.intp]
     moves: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
 
 
 def follow(spots: Spots, fragment: NDArray[np.intp], seconds: NDArray[np.float64]) -> Tracks:
@@ -111,7 +113,7 @@ def follow(spots: Spots, fragment: NDArray[np.intp], seconds: NDArray[np.float64
     share = np.bincount(of, weights=moving, minlength=len(tracks)) / np.maximum(
         np.bincount(of, minlength=len(tracks)), 1
     )
-    return Tracks(of, share >= 0.5)
+    return Tracks(of, share >= 0.5, moving)
 
 
 class _View:
