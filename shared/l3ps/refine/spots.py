@@ -80,7 +80,8 @@ def find_spots(
         primal: (N,) uint8 class before the vote.
         origins: (S, 3) the sensor's place at each scan, scene frame.
     """
-    member = np.flatnonzero(NUSCENES16.is_thing[semantic] & np.isfinite(points).all(axis=1))
+    member = np.flatnonzero(NUSCENES16.is_thing[semantic])
+    member = member[np.isfinite(points[member]).all(axis=1)]
     scan_of = np.searchsorted(bounds, member, side="right") - 1
     kind_of = KIND_OF[semantic[member]]
     own = points[member, :2].astype(np.float64)
@@ -96,7 +97,7 @@ def find_spots(
     votes = np.bincount(of * CLASSES + first, minlength=number * CLASSES) + _REFINED * np.bincount(
         of * CLASSES + semantic[member], minlength=number * CLASSES
     )
-    order = np.argsort(of, kind="stable")
+    order = grouped(of, number)
     highest = np.maximum.reduceat(points[member[order], 2], np.cumsum(count) - count) if number else np.zeros(0)
     return Spots(
         member,
