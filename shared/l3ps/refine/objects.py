@@ -57,14 +57,14 @@ def scene_instances(
         return instance, semantic
     fragment = mingled(spots, find_fragments(spots))
     clean = of_one_kind(spots, fragment)
-    tracks = clear_ways(clean, fragment, follow(clean, fragment, seconds), seconds)
+    tracks, claimed = clear_ways(clean, fragment, follow(clean, fragment, seconds), seconds)
     found = standing_objects(of_one_kind(spots, tracks.of), tracks)
     found = _by_first_cell(found)
     instance[spots.member] = found[spots.of] + 1
     if not one_class:
         return instance, semantic
     refined = semantic.copy()
-    refined[spots.member] = _classes(spots, found)[found][spots.of]
+    refined[spots.member] = classes_of(spots, found, ~claimed)[found][spots.of]
     return instance, refined
 
 
@@ -76,17 +76,24 @@ def _by_first_cell(found: NDArray[np.intp]) -> NDArray[np.intp]:
     return rank[of]
 
 
-def _classes(spots: Spots, found: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """(O,) class of each object by the votes of all its points and its usual size in a scan."""
+def classes_of(spots: Spots, found: NDArray[np.intp], heard: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """(O,) class of each object by the votes of all its points and its usual size in a scan.
+
+    Of cells that are not ``heard`` only the place is known to be the object's: labels called them something else, and
+    they vote where the object has no others.
+    """
     number = int(found.max()) + 1
+    heard = heard | (np.bincount(found[heard], minlength=number) == 0)[found]
     scans = int(spots.scan.max()) + 1
-    names, view = np.unique(found.astype(np.int64) * scans + spots.scan, return_inverse=True)
+    object_of = found[heard]
+    names, view = np.unique(object_of.astype(np.int64) * scans + spots.scan[heard], return_inverse=True)
     of = names // scans
-    length, width = rectangle(extents(spots.xy, view, len(names)))
-    height = top(spots.height, view, len(names))
+    length, width = rectangle(extents(spots.xy[heard], view, len(names)))
+    height = top(spots.height[heard], view, len(names))
     high, long, wide = (quantile(values, of, number, _USUAL) for values in (height, length, width))
     distance = np.full(number, np.inf)
-    np.minimum.at(distance, found, spots.distance)
+    np.minimum.at(distance, object_of, spots.distance[heard])
     well_seen = (distance < NEAR) & (np.bincount(of, minlength=number) >= _SEVERAL)
     longest = np.where(well_seen, quantile(length, of, number, _MOST), np.inf)
-    return likely_class(total_votes(spots.votes, found, number), high, long, wide, longest).astype(np.uint8)
+    votes = total_votes(spots.votes[heard], object_of, number)
+    return likely_class(votes, high, long, wide, longest).astype(np.uint8)

@@ -83,7 +83,9 @@ class _Ways:
     reach: NDArray[np.float64]
 
 
-def clear_ways(spots: Spots, fragment: NDArray[np.intp], tracks: Tracks, seconds: NDArray[np.float64]) -> Tracks:
+def clear_ways(
+    spots: Spots, fragment: NDArray[np.intp], tracks: Tracks, seconds: NDArray[np.float64]
+) -> tuple[Tracks, NDArray[np.bool_]]:
     """Cut moving tracks where nothing drives, and give them what lies in their way.
 
     Args:
@@ -91,12 +93,16 @@ def clear_ways(spots: Spots, fragment: NDArray[np.intp], tracks: Tracks, seconds
         fragment: (K,) fragment of each.
         tracks: which track each is of.
         seconds: (S,) time of each scan.
+
+    Returns:
+        The tracks, and (K,) whether a cell came to its track by where it lies.
     """
-    of = _without_kinks(spots, tracks, seconds)
-    moves = np.bincount(of, weights=tracks.moving) >= 0.5 * np.bincount(of)
+    parts = _without_kinks(spots, tracks, seconds)
+    moves = np.bincount(parts, weights=tracks.moving) >= 0.5 * np.bincount(parts)
+    of = parts
     for _ in range(_ROUNDS):
         of = _claimed(spots, fragment, of, moves, seconds)
-    return Tracks(of, moves, tracks.moving)
+    return Tracks(of, moves, tracks.moving), of != parts
 
 
 def _views(spots: Spots, of: NDArray[np.intp], number: int) -> _Views:
