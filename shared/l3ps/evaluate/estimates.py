@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,34 +78,30 @@ def estimate_scene(
     points: NDArray[np.float32],
     cluster: NDArray[np.int32],
     primal: Sequence[ScanLabels],
-    refined: Sequence[ScanLabels],
+    refined: NDArray[np.uint8],
+    confidence: NDArray[np.uint8] | None = None,
 ) -> list[ScanEstimate]:
-    """:func:`estimate_scans` of labels as they come out of the refinement.
+    """:func:`estimate_scans` of labels as they come out of the vote.
 
     Args:
         points: (N, 3) float32, metres, scene frame.
         cluster: (N,) int32 cluster, -1 for none.
         primal: the labels before the vote, scan by scan.
-        refined: those after it.
+        refined: (N,) uint8 class after it.
+        confidence: (N,) uint8, 255 = certain; None where there is none.
     """
-
-    def joined(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any] | None:
-        known = [part for part in parts if part is not None]
-        return np.concatenate(known) if known and len(known) == len(parts) else None
-
-    before, after = joined([s.semantic for s in primal]), joined([s.semantic for s in refined])
-    if before is None or after is None:
+    if not primal:
         return []
-    seen = [None if s.evidence is None else seen_twice(s.evidence.cameras, s.evidence.agree) for s in primal]
+    seen = [seen_twice(s.evidence.cameras, s.evidence.agree) for s in primal if s.evidence is not None]
     return estimate_scans(
-        [s.token for s in refined],
-        np.cumsum([0, *(len(s.semantic) for s in refined)]),
+        [s.token for s in primal],
+        np.cumsum([0, *(len(s.semantic) for s in primal)]),
         points,
         cluster,
-        before,
-        after,
-        joined(seen),
-        joined([s.confidence for s in refined]),
+        np.concatenate([s.semantic for s in primal]),
+        refined,
+        np.concatenate(seen) if len(seen) == len(primal) else None,
+        confidence,
     )
 
 

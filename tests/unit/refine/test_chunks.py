@@ -1,7 +1,5 @@
 """A scene in chunks: every scan once, ids that go through the seams, and the labels of the whole."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +9,7 @@ from l3ps.drivelog.types import Points, Scan, Scene
 from l3ps.labels.types import ScanLabels
 from l3ps.pipeline import refine_scene
 from l3ps.presets import FAST
-from l3ps.refine.chunks import Chunk, Merger, plan, shared_points
+from l3ps.refine.chunks import Chunk, plan
 
 CAR, ROAD, MANMADE = 4, 11, 15
 
@@ -34,63 +32,6 @@ def test_neighbouring_chunks_share_a_quarter_and_each_keeps_what_is_central():
     assert plan([10] * 12) == [Chunk(0, 12, 0, 12)]
     assert plan([10] * 4, starts=(0, 3)) == [Chunk(0, 3, 0, 3), Chunk(3, 4, 3, 4)]
     assert plan([]) == []
-
-
-def labels(token, instance, semantic=CAR):
-    instance = np.array(instance, np.int32)
-    return ScanLabels(token, np.where(instance > 0, semantic, ROAD).astype(np.uint8), instance)
-
-
-def merged(*parts):
-    merger = Merger()
-    for chunk, scans in parts:
-        merger.add(chunk, scans)
-    return [scan.instance.tolist() for scan in merger.labels]
-
-
-def test_an_object_keeps_its_id_over_the_seam_and_others_get_new_ones():
-    first = [labels("a", [1, 1, 2, 2, 0]), labels("b", [1, 1, 2, 2, 0])]
-    # The second chunk counts anew: its 2 is the first's 1, its 1 the first's 2, and 3 is new.
-    second = [labels("b", [2, 2, 1, 1, 0]), labels("c", [2, 3, 3, 1, 0])]
-    assert merged((Chunk(0, 2, 0, 1), first), (Chunk(1, 3, 1, 3), second)) == [
-        [1, 1, 2, 2, 0],
-        [1, 1, 2, 2, 0],
-        [1, 3, 3, 2, 0],
-    ]
-
-
-def test_ids_do_not_meet_by_chance_in_chunks_that_share_nothing():
-    first, second = [labels("a", [1, 2])], [labels("b", [1, 2])]
-    assert merged((Chunk(0, 1, 0, 1), first), (Chunk(1, 2, 1, 2), second)) == [[1, 2], [3, 4]]
-
-
-def test_two_objects_never_become_one_by_the_seam():
-    """The first chunk holds as one what the second tells apart: the larger part keeps the id."""
-    first, second = [labels("a", [1, 1, 1, 1, 1])], [labels("a", [1, 1, 1, 2, 2])]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 1, 2, 2]]
-
-
-def test_an_object_keeps_its_id_where_chunks_judge_its_class_differently():
-    first, second = [labels("a", [1, 1, 2])], [labels("a", [2, 2, 1], semantic=7)]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 2]]
-
-
-def test_ids_that_share_few_points_are_different():
-    first, second = [labels("a", [1, 1, 1, 0, 0, 0])], [labels("a", [0, 0, 1, 1, 1, 1])]
-    assert shared_points(first, second) == [(1, 1, 1, 3)]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[0, 0, 2, 2, 2, 2]]
-
-
-def test_one_chunk_comes_out_as_it_went_in():
-    scans = [labels("a", [7, 0, 3]), labels("b", [3, 3, 3])]
-    assert merged((Chunk(0, 2, 0, 2), scans)) == [[7, 0, 3], [3, 3, 3]]
-
-
-def test_other_arrays_of_the_labels_go_along():
-    merger = Merger()
-    scan = labels("a", [1])
-    merger.add(Chunk(0, 1, 0, 1), [scan])
-    assert merger.labels[0] == replace(scan, instance=merger.labels[0].instance)
 
 
 @pytest.fixture(scope="module")
