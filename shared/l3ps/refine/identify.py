@@ -101,7 +101,7 @@ def identify(
         part = slice(first, stop)
         tell = functools.partial(_tell, progress, first, len(scans))
         refined += _with_objects(scans[part], primal[part], motion.poses[part], seconds[part], preset, taken, tell)
-        taken = max(taken, *(int(labels.instance.max(initial=0)) for labels in refined[part]))
+        taken = max([taken, *(int(labels.instance.max(initial=0)) for labels in refined[part])])
         tell(stop - first)
     return refined
 

@@ -1,4 +1,4 @@
-"""A scene in chunks: every scan once, ids that go through the seams, and the labels of the whole."""
+"""A scene in chunks: every scan once, the labels of the whole, and no id that ends at a seam."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from l3ps.drivelog.types import Points, Scan, Scene
 from l3ps.labels.types import ScanLabels
 from l3ps.pipeline import refine_scene
-from l3ps.presets import FAST
+from l3ps.presets import FAST, PAPER
 from l3ps.refine.chunks import Chunk, plan
+from l3ps.refine.instances import correct_instances
 
 CAR, ROAD, MANMADE = 4, 11, 15
 
@@ -58,12 +59,12 @@ def long_street():
         token = f"scan{index}"
         scans.append(Scan(token, index, index * 500_000, None, np.eye(4), pose, (), lambda points=points: points))
         semantic = np.where(rng.random(6000) < 0.15, MANMADE, truth[chosen]).astype(np.uint8)
-        primal.append(ScanLabels(token, semantic, np.zeros(6000, np.int32)))
+        primal.append(ScanLabels(token, semantic, np.where(semantic == CAR, object_of[chosen], 0).astype(np.int32)))
         objects.append(object_of[chosen])
     return Scene("street", tuple(scans)), primal, objects
 
 
-def test_chunks_give_the_labels_of_the_whole(long_street):
+def test_chunks_give_the_labels_of_the_whole_and_the_same_objects(long_street):
     scene, primal, objects = long_street
     largest = []
 
@@ -95,8 +96,24 @@ def test_chunks_give_the_labels_of_the_whole(long_street):
     np.testing.assert_array_equal(chunked.poses, whole.poses)
     differ = [(one.semantic != other.semantic).mean() for one, other in zip(chunked.labels, whole.labels, strict=True)]
     assert np.mean(differ) < 0.02
+    pairs = set()
+    for one, other in zip(chunked.labels, whole.labels, strict=True):
+        same = (one.semantic == other.semantic) & (one.semantic == CAR)
+        pairs |= set(zip(one.instance[same].tolist(), other.instance[same].tolist(), strict=True))
+    assert len(pairs) == len({one for one, _ in pairs}) == len({other for _, other in pairs}), "no id is cut or joined"
     for labels, truth in zip(chunked.labels, objects, strict=True):
         for car in range(1, 12):
             ids = labels.instance[(truth == car) & (labels.semantic == CAR)]
             if len(ids) > 30:
                 assert (ids == np.bincount(ids).argmax()).mean() > 0.95
+
+
+def test_in_chunks_too_the_published_rule_mends_each_scans_own_ids(long_street):
+    scene, primal, _ = long_street
+    refined = refine_scene(scene, primal, PAPER, sensor_height=1.7, max_points=30000).labels
+    changed = 0
+    for scan, before, after in zip(scene.scans, primal, refined, strict=True):
+        given = (before.semantic, before.instance, after.semantic)
+        np.testing.assert_array_equal(after.instance, correct_instances(scan.load_points().xyz, *given))
+        changed += ((after.semantic == CAR) & (before.semantic != CAR)).sum()
+    assert changed > 100, "the rule must have had something to do"

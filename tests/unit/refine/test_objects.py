@@ -273,6 +273,17 @@ def test_an_id_has_one_class_and_ids_run_from_one(scans):
     assert ((instance > 0) == ((arguments[3] >= 1) & (arguments[3] <= 10))).all()
 
 
+@given(small_scenes())
+def test_the_thing_points_alone_give_the_same_objects(scans):
+    arguments, _ = scene(*scans)
+    points, bounds, floor, semantic, primal, *rest = arguments
+    thing = np.flatnonzero(semantic != ROAD)
+    instance, refined = scene_instances(*arguments)
+    alone = scene_instances(points[thing], np.searchsorted(thing, bounds), floor, semantic[thing], primal[thing], *rest)
+    assert (alone[0] == instance[thing]).all()
+    assert (alone[1] == refined[thing]).all()
+
+
 @given(small_scenes(), st.integers(0, 2**32 - 1))
 def test_the_order_of_a_scans_points_does_not_matter(scans, seed):
     arguments, _ = scene(*scans)
