@@ -112,7 +112,7 @@ def refine_scene(
         threads: threads of each step.
         progress: told after each scan and step.
         clusterer: implementation of HDBSCAN; None takes that of ``l3ps_cluster``.
-        max_points: a scene of more points is refined in overlapping chunks of at most so many; None sets no limit.
+        max_points: a scene of more points is clustered in overlapping chunks of at most so many; None sets no limit.
 
     Returns:
         The refined labels in point-file order.
@@ -127,14 +127,11 @@ def refine_scene(
     estimates: list[ScanEstimate] = []
     chunks = plan([len(mask) for mask in ground], motion.starts, max_points)
     for index, chunk in enumerate(chunks):
-        tell = progress_of(progress, index, len(chunks))
-        own, kept = slice(chunk.first, chunk.stop), slice(chunk.kept_first - chunk.first, chunk.kept_stop - chunk.first)
-        part = Scene(scene.name, scene.scans[own])
-        scans, judged = _vote(
-            part, primal[own], ground[own], motion.part(chunk.first, chunk.stop), preset, threads, book, tell, clusterer
-        )
-        voted += scans[kept]
-        estimates += judged[kept]
+        own, tell = chunk.scans, progress_of(progress, index, len(chunks))
+        part = motion.part(chunk.first, chunk.stop)
+        scans, judged = _vote(scene.scans[own], primal[own], ground[own], part, preset, threads, book, tell, clusterer)
+        voted += scans[chunk.kept]
+        estimates += judged[chunk.kept]
     with book.span("instances"):
         seconds = np.array([scan.timestamp for scan in scene.scans]) / 1e6
         labels = identify(voted, primal, motion, seconds, preset, progress)
@@ -167,7 +164,7 @@ def _survey(
 
 
 def _vote(
-    scene: Scene,
+    scans: Sequence[Scan],
     primal: Sequence[ScanLabels],
     grounds: Sequence[NDArray[np.bool_]],
     motion: Motion,
@@ -182,7 +179,7 @@ def _vote(
 
     with book.span("accumulate"):
         points = np.empty((bounds[-1], 3), dtype=np.float32)
-        for index, scan in enumerate(scene.scans):
+        for index, scan in enumerate(scans):
             cloud = scan.load_points()
             xyz = deskew(cloud.xyz, cloud.time, motion.velocity[index]) if preset.deskew else cloud.xyz
             points[bounds[index] : bounds[index + 1]] = transform(xyz, motion.poses[index])
@@ -202,14 +199,13 @@ def _vote(
 
     with book.span("vote"):
         verdict = decide(points, ground, cluster, noise, primal, preset)
-        parts = list(map(slice, bounds[:-1], bounds[1:]))
-        scans = [
+        voted = [
             VotedScan.of(scan.token, points[own], ground[own], verdict.of(own))
-            for scan, own in zip(scene.scans, parts, strict=True)
+            for scan, own in zip(scans, map(slice, bounds[:-1], bounds[1:]), strict=True)
         ]
         progress("vote", 1, 1)
 
-    return scans, estimate_scene(points, cluster, primal, verdict.semantic, verdict.confidence)
+    return voted, estimate_scene(points, cluster, primal, verdict.semantic, verdict.confidence)
 
 
 _REMEDY = "Use the primal labels that were made from this log."

@@ -19,12 +19,14 @@ from l3ps.progress import Progress
 OVERLAP = 0.25
 """Share of a chunk's points that the next chunk has too."""
 BYTES_A_POINT = 300
-"""What refinement needs at its peak, to turn a budget of memory into one of points."""
+"""What a chunk needs at its peak, to turn a budget of memory into one of points: measured are 100 to 170. What is kept
+of the whole scene meanwhile is 20 a point, and to tell its objects apart, when no chunk is held, takes 80 where half of
+the points are things."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Scans that are refined together.
+    """Scans that are clustered together.
 
     Attributes:
         first: first scan.
@@ -37,6 +39,16 @@ class Chunk:
     stop: int
     kept_first: int
     kept_stop: int
+
+    @property
+    def scans(self) -> slice:
+        """Its scans among those of the scene."""
+        return slice(self.first, self.stop)
+
+    @property
+    def kept(self) -> slice:
+        """The kept ones among its scans."""
+        return slice(self.kept_first - self.first, self.kept_stop - self.first)
 
 
 def plan(sizes: Sequence[int], starts: Sequence[int] = (0,), max_points: int | None = None) -> list[Chunk]:
