@@ -1,6 +1,7 @@
 """Objects of a whole scene, each with one id and one class in all scans (an addition to the paper's section III-D).
 
-thing points ─▶ cells ─▶ fragments of each scan ─▶ tracks ─▶ standing objects from all scans ─▶ one class each
+thing points ─▶ cells ─▶ fragments of each scan ─▶ tracks ─▶ what lies in their way ─▶ standing objects from all scans
+─▶ one class each
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from l3ps.refine.kinds import likely_class
 from l3ps.refine.spots import Spots, extents, find_spots, quantile, rectangle, top, total_votes
 from l3ps.refine.standing import standing_objects
 from l3ps.refine.tracks import Advance, follow
+from l3ps.refine.ways import clear_ways
 
 _USUAL = 0.6
 """Share of an object's scans whose view is no larger than the size that decides its class."""
@@ -56,7 +58,8 @@ def scene_instances(
     if len(spots) == 0:
         return instance, semantic
     fragment = mingled(spots, find_fragments(spots))
-    tracks = follow(of_one_kind(spots, fragment), fragment, seconds, advance)
+    clean = of_one_kind(spots, fragment)
+    tracks = clear_ways(clean, fragment, follow(clean, fragment, seconds, advance), seconds)
     found = standing_objects(of_one_kind(spots, tracks.of), tracks)
     found = _by_first_cell(found)
     instance[spots.member] = found[spots.of] + 1

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from l3ps.refine.fragments import NEAR, divided
 from l3ps.refine.kinds import KINDS, LENGTH, WIDTH, likely_class
-from l3ps.refine.spots import Spots, extents, linked, rectangle, top, total_votes
+from l3ps.refine.spots import Spots, compact, extents, linked, rectangle, top, total_votes
 from l3ps.refine.tracks import Tracks
 
 _CELL = 0.2
@@ -129,24 +129,24 @@ def _neighbours(
 def _reclaimed(spots: Spots, found: NDArray[np.intp], tracks: Tracks) -> NDArray[np.intp]:
     """(K,) objects, where what a moving track took for itself in a place that is never empty goes back.
 
-    A parked car that a driving one passes is its continuation by every measure in that one scan.
+    A parked car that a driving one passes is its continuation by every measure in that one scan, and that of a cyclist
+    where labels call the two one thing.
     """
     moves = tracks.moves[tracks.of]
     still, moving = np.flatnonzero(~moves), np.flatnonzero(moves)
     if len(moving) == 0 or len(still) == 0:
         return found
-    follows = np.array([kind.follows for kind in KINDS])[spots.kind]
     key = np.floor((spots.xy - spots.xy.min(axis=0)) / _HELD_CELL).astype(np.int64)
-    wide = key.max(axis=0) + 1
-    place = (follows * wide[0] + key[:, 0]) * wide[1] + key[:, 1]
-    seen = np.unique(np.stack([place[still], found[still], spots.scan[still]], axis=1), axis=0)
-    held, scans = np.unique(seen[:, :2], axis=0, return_counts=True)
-    order = np.lexsort((-scans, held[:, 0]))
-    places, first = np.unique(held[order, 0], return_index=True)
-    holder, scans = held[order[first], 1], scans[order[first]]
+    place = key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]
+    objects, moments = int(found.max()) + 1, int(spots.scan.max()) + 1
+    seen = np.unique((place[still] * objects + found[still]) * moments + spots.scan[still])
+    held, scans = np.unique(seen // moments, return_counts=True)
+    order = np.lexsort((-scans, held // objects))
+    places, first = np.unique(held[order] // objects, return_index=True)
+    holder, scans = held[order[first]] % objects, scans[order[first]]
     at = np.minimum(np.searchsorted(places, place[moving]), len(places) - 1)
     occupied = (places[at] == place[moving]) & (scans[at] >= _OCCUPIED)
-    view = np.unique(np.stack([found[moving], spots.scan[moving]], axis=1), axis=0, return_inverse=True)[1].ravel()
+    view = compact(found[moving] * moments + spots.scan[moving])
     share = np.bincount(view, weights=occupied) / np.bincount(view)
     mistaken = occupied & (share[view] >= _MISTAKEN)
     out = found.copy()

@@ -64,9 +64,8 @@ class _Track:
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     moving: bool = False
     views: int = 1
-
-    def middle(self) -> NDArray[np.float64]:
-        return np.asarray((self.view.min(axis=0) + self.view.max(axis=0)) / 2)
+    middle: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    """Of the box around that view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +75,12 @@ class Tracks:
     Attributes:
         of: (K,) track.
         moves: (T,) whether a track moves in most of its scans.
+        moving: (K,) whether the cell's track moved in that scan.
     """
 
     of: NDArray[np.intp]
     moves: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
 
 
 Advance = Callable[[int], None]
@@ -120,7 +121,7 @@ def follow(
     share = np.bincount(of, weights=moving, minlength=len(tracks)) / np.maximum(
         np.bincount(of, minlength=len(tracks)), 1
     )
-    return Tracks(of, share >= 0.5)
+    return Tracks(of, share >= 0.5, moving)
 
 
 class _View:
@@ -195,7 +196,7 @@ def _match(view: _View, taken: NDArray[np.intp], tracks: list[_Track], scan: int
     np.minimum.at(low, view.fragment, view.xy)
     np.maximum.at(high, view.fragment, view.xy)
     waited = np.array([seconds[scan] - seconds[tracks[k].scan] for k in free])
-    place = np.array([tracks[k].middle() + tracks[k].velocity * wait for k, wait in zip(free, waited, strict=True)])
+    place = np.array([tracks[k].middle + tracks[k].velocity * wait for k, wait in zip(free, waited, strict=True)])
     kind = np.array([tracks[k].kind for k in free])
     steady = np.array([tracks[k].moving for k in free])
     gate = _SPEED[kind] * waited
@@ -227,15 +228,35 @@ def _update(
             track.moving = bool(np.hypot(*shift) >= _STILL) and wait > 0
             velocity = shift / wait if track.moving else np.zeros(2)
             track.velocity = (track.velocity + velocity) / 2 if track.moving and was_moving else velocity
-    for k, cells in now.items():
+    middle, _ = _centres(view.xy[order], first)
+    for (k, cells), centre in zip(now.items(), middle, strict=True):
         track = tracks[k]
-        track.view, track.scan, track.views = cells, scan, track.views + 1
+        track.view, track.scan, track.views, track.middle = cells, scan, track.views + 1, centre
         if track.moving:
             track.places = cells
-        else:
-            both = np.concatenate([track.places, cells])
-            key = np.round(both / _KEPT).astype(np.int64)
-            track.places = both[np.unique(key[:, 0] << 32 ^ key[:, 1] & 0xFFFFFFFF, return_index=True)[1]]
+    still = [tracks[k] for k in now if not tracks[k].moving]
+    both = [np.concatenate([track.places, track.view]) for track in still]
+    for track, places in zip(still, _thinned(both), strict=True):
+        track.places = places
+
+
+def _thinned(sets: list[Places]) -> list[Places]:
+    """Of each set one place a cell."""
+    if not sets:
+        return sets
+    places, of = np.concatenate(sets), np.repeat(np.arange(len(sets)), [len(one) for one in sets])
+    key = np.round(places / _KEPT).astype(np.int64)
+    key -= key.min(axis=0)
+    wide = key.max(axis=0) + 1
+    kept = np.unique((of * wide[0] + key[:, 0]) * wide[1] + key[:, 1], return_index=True)[1]
+    return np.split(places[kept], np.searchsorted(of[kept], np.arange(1, len(sets))))
+
+
+def _centres(cells: Places, first: NDArray[np.intp]) -> tuple[Places, Places]:
+    """Middles of the boxes around views (V, 2), and their means; the cells of each view begin at ``first``."""
+    low, high = np.minimum.reduceat(cells, first), np.maximum.reduceat(cells, first)
+    count = np.diff(np.append(first, len(cells)))
+    return (low + high) / 2, np.add.reduceat(cells, first) / count[:, None]
 
 
 def _displacement(before: list[Places], after: list[Places], predicted: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,11 +267,12 @@ def _displacement(before: list[Places], after: list[Places], predicted: NDArray[
     """
     number = len(before)
     old, new = np.concatenate(before), np.concatenate(after)
-    of_old = np.repeat(np.arange(number), [len(places) for places in before])
-    of_new = np.repeat(np.arange(number), [len(places) for places in after])
-    middle = [np.array([(v.min(axis=0) + v.max(axis=0)) / 2 for v in views]) for views in (before, after)]
-    mean = [np.array([v.mean(axis=0) for v in views]) for views in (before, after)]
-    guesses = np.stack([np.zeros((number, 2)), middle[1] - middle[0], mean[1] - mean[0], predicted])
+    sizes = [np.array([len(places) for places in views]) for views in (before, after)]
+    of_old, of_new = (np.repeat(np.arange(number), size) for size in sizes)
+    (old_middle, old_mean), (new_middle, new_mean) = (
+        _centres(cells, np.cumsum(size) - size) for cells, size in zip((old, new), sizes, strict=True)
+    )
+    guesses = np.stack([np.zeros((number, 2)), new_middle - old_middle, new_mean - old_mean, predicted])
     old_tree = cKDTree(np.column_stack([old, 100.0 * of_old]))
     new_tree = cKDTree(np.column_stack([new, 100.0 * of_new]))
     sample_old, sample_new = _sample(of_old), _sample(of_new)

@@ -33,7 +33,7 @@ def test_gaps_of_a_fragment_grow_with_the_distance():
 
 def test_standing_cells_are_one_object_whatever_the_tracks_of_the_scans_were():
     spots = spots_of(*[[block(8, 3)]] * 4)
-    found = standing_objects(spots, Tracks(spots.scan.copy(), np.zeros(4, bool)))
+    found = standing_objects(spots, Tracks(spots.scan.copy(), np.zeros(4, bool), np.zeros(4, bool)))
     assert len(set(found)) == 1
 
 
@@ -45,7 +45,7 @@ def test_a_moving_track_gives_back_what_stands_in_the_other_scans():
     is_parked = spots.xy[:, 1] > 4
     of = np.where(is_parked, 1, 0)
     of[is_parked & (spots.scan == 2)] = 0
-    found = standing_objects(spots, Tracks(of, np.array([True, False])))
+    found = standing_objects(spots, Tracks(of, np.array([True, False]), of == 0))
     assert len(set(found[is_parked])) == 1
     assert not set(found[is_parked]) & set(found[~is_parked])
 
@@ -53,5 +53,5 @@ def test_a_moving_track_gives_back_what_stands_in_the_other_scans():
 def test_a_moving_track_keeps_the_place_where_nothing_else_stands():
     spots = spots_of(*[[block(-9 + 3 * t, 0), block(8, 6)] for t in range(5)])
     of = np.where(spots.xy[:, 1] > 4, 1, 0)
-    found = standing_objects(spots, Tracks(of, np.array([True, False])))
+    found = standing_objects(spots, Tracks(of, np.array([True, False]), of == 0))
     assert len(set(found[of == 0])) == 1
