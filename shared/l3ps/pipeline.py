@@ -3,6 +3,9 @@
     images  ── segment ──▶ panoptic images ── project ──▶ primal labels        primal_labels()
     primal labels ── accumulate ▶ ground ▶ cluster ▶ vote ▶ instances ──▶ refined labels      refine_scene()
 
+What needs the points around a point, that is cluster and vote, may go through the scene in chunks; poses, ground and
+objects are those of the whole scene.
+
 After "Label-Efficient LiDAR Panoptic Segmentation" (arXiv 2503.02372), sections III-C and III-D. Arrays in, arrays
 out: no service, queue, database or terminal is known here. Progress goes through one callable, which may raise
 :class:`l3ps.errors.Cancelled` between two units of work.
@@ -25,12 +28,12 @@ from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent
 from l3ps.refine.accumulate import deskew, transform
-from l3ps.refine.chunks import Merger, plan, progress_of
+from l3ps.refine.chunks import plan, progress_of
 from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.ground import GroundSegmenter
-from l3ps.refine.identify import identify
+from l3ps.refine.identify import VotedScan, identify
 from l3ps.refine.poses import Motion, PoseTracker
-from l3ps.refine.verdict import decide, of_objects
+from l3ps.refine.verdict import decide
 from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
@@ -109,7 +112,7 @@ def refine_scene(
         threads: threads of each step.
         progress: told after each scan and step.
         clusterer: implementation of HDBSCAN; None takes that of ``l3ps_cluster``.
-        max_points: a scene of more points is refined in overlapping chunks of at most so many; None sets no limit.
+        max_points: a scene of more points is clustered in overlapping chunks of at most so many; None sets no limit.
 
     Returns:
         The refined labels in point-file order.
@@ -120,25 +123,19 @@ def refine_scene(
     """
     book = CostBook()
     motion, ground = _survey(scene, primal, preset, sensor_height, book, progress)
-    chunks = plan([len(mask) for mask in ground], motion.starts, max_points)
-    merger = Merger()
+    voted: list[VotedScan] = []
     estimates: list[ScanEstimate] = []
+    chunks = plan([len(mask) for mask in ground], motion.starts, max_points)
     for index, chunk in enumerate(chunks):
-        own = slice(chunk.first, chunk.stop)
-        labels, judged = _refine_chunk(
-            scene.scans[own],
-            primal[own],
-            ground[own],
-            motion.part(chunk.first, chunk.stop),
-            preset,
-            threads,
-            book,
-            progress_of(progress, index, len(chunks)),
-            clusterer,
-        )
-        merger.add(chunk, labels)
-        estimates += judged[chunk.kept_first - chunk.first : chunk.kept_stop - chunk.first]
-    return RefinedScene(merger.labels, motion.poses, book.stages, estimates, motion)
+        own, tell = chunk.scans, progress_of(progress, index, len(chunks))
+        part = motion.part(chunk.first, chunk.stop)
+        scans, judged = _vote(scene.scans[own], primal[own], ground[own], part, preset, threads, book, tell, clusterer)
+        voted += scans[chunk.kept]
+        estimates += judged[chunk.kept]
+    with book.span("instances"):
+        seconds = np.array([scan.timestamp for scan in scene.scans]) / 1e6
+        labels = identify(voted, primal, motion, seconds, preset, progress)
+    return RefinedScene(labels, motion.poses, book.stages, estimates, motion)
 
 
 def _survey(
@@ -166,7 +163,7 @@ def _survey(
     return tracker.motion(), ground
 
 
-def _refine_chunk(
+def _vote(
     scans: Sequence[Scan],
     primal: Sequence[ScanLabels],
     grounds: Sequence[NDArray[np.bool_]],
@@ -176,8 +173,8 @@ def _refine_chunk(
     book: CostBook,
     progress: Progress,
     clusterer: Clusterer | None,
-) -> tuple[list[ScanLabels], list[ScanEstimate]]:
-    """Refined labels of scans that are accumulated in one frame, and how good they seem."""
+) -> tuple[list[VotedScan], list[ScanEstimate]]:
+    """Classes of scans that are laid over each other in one frame, and how good they seem."""
     bounds = np.cumsum([0, *map(len, grounds)])
 
     with book.span("accumulate"):
@@ -202,25 +199,13 @@ def _refine_chunk(
 
     with book.span("vote"):
         verdict = decide(points, ground, cluster, noise, primal, preset)
+        voted = [
+            VotedScan.of(scan.token, points[own], ground[own], verdict.of(own))
+            for scan, own in zip(scans, map(slice, bounds[:-1], bounds[1:]), strict=True)
+        ]
         progress("vote", 1, 1)
 
-    with book.span("instances"):
-        times = np.array([scan.timestamp for scan in scans]) / 1e6
-        found = identify(points, bounds, ground, verdict.semantic, primal, motion.poses, times, preset)
-        settled = of_objects(verdict, found)
-        refined = [
-            ScanLabels(
-                labels.token,
-                settled.semantic[part],
-                found.instance[part],
-                confidence=settled.confidence[part],
-                provenance=settled.provenance[part],
-            )
-            for labels, part in zip(primal, map(slice, bounds[:-1], bounds[1:]), strict=True)
-        ]
-        progress("instances", 1, 1)
-
-    return refined, estimate_scene(points, cluster, primal, refined)
+    return voted, estimate_scene(points, cluster, primal, verdict.semantic, verdict.confidence)
 
 
 _REMEDY = "Use the primal labels that were made from this log."

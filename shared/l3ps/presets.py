@@ -82,9 +82,8 @@ class Preset:
         voting: see :class:`Voting`.
         evidence: cameras vote with their class probabilities; False takes each primal label for one vote, as published.
         consensus: see :class:`Consensus`; None lets the cluster alone decide, as published.
-        instances: ``published`` mends the ids of the images, ``geometry`` takes objects from the points of a scan,
-            ``scene`` from those of all scans: one id and one class an object throughout (:mod:`l3ps.refine.objects`).
-        instance_gap: metres between two objects of a class, for ``geometry``.
+        instances: ``published`` mends the ids of the images, ``scene`` takes objects from the points of all scans: one
+            id and one class an object throughout (:mod:`l3ps.refine.objects`).
         instance_class: the points of an object take the class that most of them, over all scans, vote for and that fits
             its size; for ``scene``.
     """
@@ -99,8 +98,7 @@ class Preset:
     voting: Voting = Voting()
     evidence: bool = False
     consensus: Consensus | None = None
-    instances: Literal["published", "geometry", "scene"] = "published"
-    instance_gap: float = 0.7
+    instances: Literal["published", "scene"] = "published"
     instance_class: bool = False
 
     def as_dict(self) -> dict[str, Any]:

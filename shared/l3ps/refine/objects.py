@@ -13,7 +13,7 @@ from l3ps.refine.fragments import NEAR, find_fragments, mingled, of_one_kind
 from l3ps.refine.kinds import likely_class
 from l3ps.refine.spots import Spots, extents, find_spots, quantile, rectangle, top, total_votes
 from l3ps.refine.standing import standing_objects
-from l3ps.refine.tracks import follow
+from l3ps.refine.tracks import Advance, follow
 from l3ps.refine.ways import clear_ways
 
 _USUAL = 0.6
@@ -27,37 +27,39 @@ _SEVERAL = 3
 def scene_instances(
     points: NDArray[np.float32],
     bounds: NDArray[np.integer],
-    ground: NDArray[np.bool_],
+    floor: NDArray[np.float32],
     semantic: NDArray[np.uint8],
     primal: NDArray[np.uint8],
     origins: NDArray[np.float64],
     seconds: NDArray[np.float64],
     *,
     one_class: bool = True,
+    advance: Advance = lambda scans: None,
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """Find the objects of a scene, follow them through its scans and let each choose one class.
 
     Args:
-        points: (N, 3) float32, metres, scene frame, z up.
+        points: (N, 3) float32, metres, scene frame, z up: all points or the things alone, which gives the same.
         bounds: (S + 1,) where each scan begins among the points, and N.
-        ground: (N,) bool partition.
+        floor: (G, 3) float32 points of the ground, metres, scene frame; heights are measured from it.
         semantic: (N,) uint8 class after the vote. Things stay things and stuff stays stuff.
         primal: (N,) uint8 class before it; its things vote for the objects' classes.
         origins: (S, 3) the sensor's place at each scan, metres, scene frame.
         seconds: (S,) time of each scan, ascending.
         one_class: let each object choose one class; else points keep theirs, and an object may have several.
+        advance: told how many scans are done; may raise to stop.
 
     Returns:
         (N,) int32 id from 1, one an object in all scans and unique over all classes, 0 for stuff, void and points that
         are not finite; and (N,) uint8 class, the same for all points of an object.
     """
-    spots = find_spots(points, bounds, ground, semantic, primal, origins)
+    spots = find_spots(points, bounds, floor, semantic, primal, origins)
     instance = np.zeros(len(points), dtype=np.int32)
     if len(spots) == 0:
         return instance, semantic
     fragment = mingled(spots, find_fragments(spots))
     clean = of_one_kind(spots, fragment)
-    tracks, claimed = clear_ways(clean, fragment, follow(clean, fragment, seconds), seconds)
+    tracks, claimed = clear_ways(clean, fragment, follow(clean, fragment, seconds, advance), seconds)
     found = standing_objects(of_one_kind(spots, tracks.of), tracks)
     found = _by_first_cell(found)
     instance[spots.member] = found[spots.of] + 1

@@ -6,6 +6,8 @@ A scene has a hundred thousand thing points on a few thousand such cells; everyt
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +67,7 @@ class Spots:
 def find_spots(
     points: NDArray[np.float32],
     bounds: NDArray[np.integer],
-    ground: NDArray[np.bool_],
+    floor: NDArray[np.float32],
     semantic: NDArray[np.uint8],
     primal: NDArray[np.uint8],
     origins: NDArray[np.float64],
@@ -73,44 +75,73 @@ def find_spots(
     """The cells that a scene's thing points occupy.
 
     Args:
-        points: (N, 3) float32, metres, scene frame, z up.
+        points: (N, 3) float32, metres, scene frame, z up: all points or the things alone.
         bounds: (S + 1,) where each scan begins among the points, and N.
-        ground: (N,) bool partition.
+        floor: (G, 3) float32 points of the ground, metres, scene frame.
         semantic: (N,) uint8 refined class.
         primal: (N,) uint8 class before the vote.
         origins: (S, 3) the sensor's place at each scan, scene frame.
     """
     member = np.flatnonzero(NUSCENES16.is_thing[semantic])
     member = member[np.isfinite(points[member]).all(axis=1)]
-    scan_of = np.searchsorted(bounds, member, side="right") - 1
-    kind_of = KIND_OF[semantic[member]]
-    own = points[member, :2].astype(np.float64)
-    edge = np.array([kind.gap for kind in KINDS])[kind_of] / _CELLS_A_GAP
-    of, count = _cells(own / edge[:, None], scan_of * len(KINDS) + kind_of)
-    number = len(count)
-    xy = np.stack([np.bincount(of, weights=own[:, axis], minlength=number) for axis in (0, 1)], axis=1) / count[:, None]
-    scan, kind = np.zeros(number, dtype=np.intp), np.zeros(number, dtype=np.intp)
-    scan[of], kind[of] = scan_of, kind_of
-    away = xy - origins[scan, :2] if number else xy
+    of = np.empty(len(member), dtype=np.intp)
+    parts, number = [_scan_spots(points[:0], semantic[:0], primal[:0])[1]], 0
+    scan = [np.zeros(0, dtype=np.intp)]
+    # A scan at a time: the cells are few, but what it takes to find them is 100 bytes a point.
+    for index, (first, stop) in enumerate(pairwise(np.searchsorted(member, bounds))):
+        own = member[first:stop]
+        found, part = _scan_spots(points[own], semantic[own], primal[own])
+        of[first:stop] = number + found
+        number += len(part.xy)
+        parts.append(part)
+        scan.append(np.full(len(part.xy), index, dtype=np.intp))
+    xy, kind, highest, count, votes = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    of_scan = np.concatenate(scan)
+    away = xy - origins[of_scan, :2] if number else xy
     distance = np.linalg.norm(away, axis=1)
-    first = np.where(NUSCENES16.is_thing[primal[member]], primal[member], VOID)
-    votes = np.bincount(of * CLASSES + first, minlength=number * CLASSES) + _REFINED * np.bincount(
-        of * CLASSES + semantic[member], minlength=number * CLASSES
-    )
-    order = grouped(of, number)
-    highest = np.maximum.reduceat(points[member[order], 2], np.cumsum(count) - count) if number else np.zeros(0)
     return Spots(
         member,
         of,
         xy,
-        scan,
+        of_scan,
         kind,
-        highest - _ground_height(points, ground, xy),
-        count.astype(np.float64),
+        highest - _ground_height(floor, xy),
+        count,
         distance,
         away / np.maximum(distance, 1e-9)[:, None],
-        votes.reshape(number, CLASSES),
+        votes,
     )
+
+
+class _ScanSpots(NamedTuple):
+    """The cells of one scan; see :class:`Spots`, but ``highest`` is a height in the scene frame."""
+
+    xy: NDArray[np.float64]
+    kind: NDArray[np.intp]
+    highest: NDArray[np.float64]
+    points: NDArray[np.float64]
+    votes: NDArray[np.float64]
+
+
+def _scan_spots(
+    points: NDArray[np.float32], semantic: NDArray[np.uint8], primal: NDArray[np.uint8]
+) -> tuple[NDArray[np.intp], _ScanSpots]:
+    """(T,) cell of each thing point of a scan, and the cells."""
+    kind_of = KIND_OF[semantic]
+    own = points[:, :2].astype(np.float64)
+    edge = np.array([kind.gap for kind in KINDS])[kind_of] / _CELLS_A_GAP
+    of, count = _cells(own / edge[:, None], kind_of)
+    number = len(count)
+    xy = np.stack([np.bincount(of, weights=own[:, axis], minlength=number) for axis in (0, 1)], axis=1) / count[:, None]
+    kind = np.zeros(number, dtype=np.intp)
+    kind[of] = kind_of
+    first = np.where(NUSCENES16.is_thing[primal], primal, VOID)
+    votes = np.bincount(of * CLASSES + first, minlength=number * CLASSES) + _REFINED * np.bincount(
+        of * CLASSES + semantic, minlength=number * CLASSES
+    )
+    highest = np.full(number, -np.inf)
+    np.maximum.at(highest, of, points[:, 2])
+    return of, _ScanSpots(xy, kind, highest, count.astype(np.float64), votes.reshape(number, CLASSES))
 
 
 def linked(points: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -190,14 +221,11 @@ def _cells(xy: NDArray[np.float64], group: NDArray[np.integer]) -> tuple[NDArray
     return of, count
 
 
-def _ground_height(
-    points: NDArray[np.float32], ground: NDArray[np.bool_], xy: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(K,) height of the ground nearest to each place, from every fourth ground point."""
-    known = np.flatnonzero(ground)[::4]
-    known = known[np.isfinite(points[known]).all(axis=1)]
+def _ground_height(floor: NDArray[np.float32], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) height of the ground nearest to each place."""
+    known = floor[np.isfinite(floor).all(axis=1)]
     if len(known) == 0 or len(xy) == 0:
         return np.zeros(len(xy))
-    of, count = _cells(points[known, :2].astype(np.float64) / _GROUND_CELL, np.zeros(len(known), dtype=np.intp))
-    mean = np.stack([np.bincount(of, weights=points[known, axis]) for axis in range(3)], axis=1) / count[:, None]
+    of, count = _cells(known[:, :2].astype(np.float64) / _GROUND_CELL, np.zeros(len(known), dtype=np.intp))
+    mean = np.stack([np.bincount(of, weights=known[:, axis]) for axis in range(3)], axis=1) / count[:, None]
     return np.asarray(mean[cKDTree(mean[:, :2]).query(xy)[1], 2])

@@ -7,6 +7,7 @@ distance (Hungarian method), which is how a track gets its first speed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,13 +83,20 @@ class Tracks:
     moving: NDArray[np.bool_]
 
 
-def follow(spots: Spots, fragment: NDArray[np.intp], seconds: NDArray[np.float64]) -> Tracks:
+Advance = Callable[[int], None]
+"""Told how many scans are done; may raise to stop."""
+
+
+def follow(
+    spots: Spots, fragment: NDArray[np.intp], seconds: NDArray[np.float64], advance: Advance = lambda scans: None
+) -> Tracks:
     """Follow fragments through the scans.
 
     Args:
         spots: the scene's cells.
         fragment: (K,) fragment of each.
         seconds: (S,) time of each scan.
+        advance: called before each scan.
     """
     tracks: list[_Track] = []
     of = np.full(len(spots), -1, dtype=np.intp)
@@ -96,6 +104,7 @@ def follow(spots: Spots, fragment: NDArray[np.intp], seconds: NDArray[np.float64
     order = np.argsort(spots.scan, kind="stable")
     edges = np.searchsorted(spots.scan[order], np.arange(len(seconds) + 1))
     for scan in range(len(seconds)):
+        advance(scan)
         own = order[edges[scan] : edges[scan + 1]]
         if len(own) == 0:
             continue

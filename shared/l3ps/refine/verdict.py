@@ -12,7 +12,6 @@ from l3ps.labels.types import Evidence, Provenance, ScanLabels
 from l3ps.presets import Preset
 from l3ps.refine.confidence import as_confidence, cluster_share
 from l3ps.refine.consensus import by_consensus
-from l3ps.refine.identify import Objects
 from l3ps.refine.vote import vote
 from l3ps.taxonomy import NUSCENES16, VOID
 
@@ -30,6 +29,27 @@ class Verdict:
     semantic: NDArray[np.uint8]
     confidence: NDArray[np.uint8]
     provenance: NDArray[np.uint8]
+
+    def of(self, points: slice | NDArray[np.intp]) -> Verdict:
+        """The verdict on some of the points."""
+        return Verdict(self.semantic[points], self.confidence[points], self.provenance[points])
+
+    def but(self, points: NDArray[np.intp], other: Verdict) -> Verdict:
+        """This verdict, with another one on some of the points."""
+        changed = Verdict(self.semantic.copy(), self.confidence.copy(), self.provenance.copy())
+        changed.semantic[points] = other.semantic
+        changed.confidence[points] = other.confidence
+        changed.provenance[points] = other.provenance
+        return changed
+
+    @classmethod
+    def joined(cls, parts: Sequence[Verdict]) -> Verdict:
+        """The verdicts on several sets of points, one after the other."""
+        return cls(
+            np.concatenate([part.semantic for part in parts]),
+            np.concatenate([part.confidence for part in parts]),
+            np.concatenate([part.provenance for part in parts]),
+        )
 
 
 def decide(
@@ -71,7 +91,7 @@ def decide(
     return Verdict(semantic, as_confidence(share, semantic), provenance)
 
 
-def of_objects(verdict: Verdict, objects: Objects) -> Verdict:
+def of_objects(verdict: Verdict, semantic: NDArray[np.uint8], instance: NDArray[np.int32]) -> Verdict:
     """The verdict after the objects had their say.
 
     A point whose class its object changed is as sure as the object is of one mind: its confidence becomes the share of
@@ -79,16 +99,16 @@ def of_objects(verdict: Verdict, objects: Objects) -> Verdict:
 
     Args:
         verdict: on each point after the vote.
-        objects: of the scene.
+        semantic: (N,) uint8 class that its object gives each point.
+        instance: (N,) int32 object, 0 for none.
     """
-    semantic, of = objects.semantic, objects.instance
     changed = np.flatnonzero(semantic != verdict.semantic)
     if len(changed) == 0:
         return verdict
-    points = np.bincount(of)
-    agreeing = np.bincount(of, weights=semantic == verdict.semantic)
+    points = np.bincount(instance)
+    agreeing = np.bincount(instance, weights=semantic == verdict.semantic)
     confidence, provenance = verdict.confidence.copy(), verdict.provenance.copy()
-    share = (agreeing / np.maximum(points, 1))[of[changed]]
+    share = (agreeing / np.maximum(points, 1))[instance[changed]]
     confidence[changed] = as_confidence(share.astype(np.float32), semantic[changed])
     provenance[changed] = Provenance.INSTANCE_RULE
     return Verdict(semantic, confidence, provenance)

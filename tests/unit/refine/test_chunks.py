@@ -1,6 +1,4 @@
-"""A scene in chunks: every scan once, ids that go through the seams, and the labels of the whole."""
-
-from dataclasses import replace
+"""A scene in chunks: every scan once, the labels of the whole, and no id that ends at a seam."""
 
 import numpy as np
 import pytest
@@ -10,8 +8,9 @@ from hypothesis import strategies as st
 from l3ps.drivelog.types import Points, Scan, Scene
 from l3ps.labels.types import ScanLabels
 from l3ps.pipeline import refine_scene
-from l3ps.presets import FAST
-from l3ps.refine.chunks import Chunk, Merger, plan, shared_points
+from l3ps.presets import FAST, PAPER
+from l3ps.refine.chunks import Chunk, plan
+from l3ps.refine.instances import correct_instances
 
 CAR, ROAD, MANMADE = 4, 11, 15
 
@@ -34,63 +33,6 @@ def test_neighbouring_chunks_share_a_quarter_and_each_keeps_what_is_central():
     assert plan([10] * 12) == [Chunk(0, 12, 0, 12)]
     assert plan([10] * 4, starts=(0, 3)) == [Chunk(0, 3, 0, 3), Chunk(3, 4, 3, 4)]
     assert plan([]) == []
-
-
-def labels(token, instance, semantic=CAR):
-    instance = np.array(instance, np.int32)
-    return ScanLabels(token, np.where(instance > 0, semantic, ROAD).astype(np.uint8), instance)
-
-
-def merged(*parts):
-    merger = Merger()
-    for chunk, scans in parts:
-        merger.add(chunk, scans)
-    return [scan.instance.tolist() for scan in merger.labels]
-
-
-def test_an_object_keeps_its_id_over_the_seam_and_others_get_new_ones():
-    first = [labels("a", [1, 1, 2, 2, 0]), labels("b", [1, 1, 2, 2, 0])]
-    # The second chunk counts anew: its 2 is the first's 1, its 1 the first's 2, and 3 is new.
-    second = [labels("b", [2, 2, 1, 1, 0]), labels("c", [2, 3, 3, 1, 0])]
-    assert merged((Chunk(0, 2, 0, 1), first), (Chunk(1, 3, 1, 3), second)) == [
-        [1, 1, 2, 2, 0],
-        [1, 1, 2, 2, 0],
-        [1, 3, 3, 2, 0],
-    ]
-
-
-def test_ids_do_not_meet_by_chance_in_chunks_that_share_nothing():
-    first, second = [labels("a", [1, 2])], [labels("b", [1, 2])]
-    assert merged((Chunk(0, 1, 0, 1), first), (Chunk(1, 2, 1, 2), second)) == [[1, 2], [3, 4]]
-
-
-def test_two_objects_never_become_one_by_the_seam():
-    """The first chunk holds as one what the second tells apart: the larger part keeps the id."""
-    first, second = [labels("a", [1, 1, 1, 1, 1])], [labels("a", [1, 1, 1, 2, 2])]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 1, 2, 2]]
-
-
-def test_an_object_keeps_its_id_where_chunks_judge_its_class_differently():
-    first, second = [labels("a", [1, 1, 2])], [labels("a", [2, 2, 1], semantic=7)]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[1, 1, 2]]
-
-
-def test_ids_that_share_few_points_are_different():
-    first, second = [labels("a", [1, 1, 1, 0, 0, 0])], [labels("a", [0, 0, 1, 1, 1, 1])]
-    assert shared_points(first, second) == [(1, 1, 1, 3)]
-    assert merged((Chunk(0, 1, 0, 0), first), (Chunk(0, 1, 0, 1), second)) == [[0, 0, 2, 2, 2, 2]]
-
-
-def test_one_chunk_comes_out_as_it_went_in():
-    scans = [labels("a", [7, 0, 3]), labels("b", [3, 3, 3])]
-    assert merged((Chunk(0, 2, 0, 2), scans)) == [[7, 0, 3], [3, 3, 3]]
-
-
-def test_other_arrays_of_the_labels_go_along():
-    merger = Merger()
-    scan = labels("a", [1])
-    merger.add(Chunk(0, 1, 0, 1), [scan])
-    assert merger.labels[0] == replace(scan, instance=merger.labels[0].instance)
 
 
 @pytest.fixture(scope="module")
@@ -117,12 +59,12 @@ def long_street():
         token = f"scan{index}"
         scans.append(Scan(token, index, index * 500_000, None, np.eye(4), pose, (), lambda points=points: points))
         semantic = np.where(rng.random(6000) < 0.15, MANMADE, truth[chosen]).astype(np.uint8)
-        primal.append(ScanLabels(token, semantic, np.zeros(6000, np.int32)))
+        primal.append(ScanLabels(token, semantic, np.where(semantic == CAR, object_of[chosen], 0).astype(np.int32)))
         objects.append(object_of[chosen])
     return Scene("street", tuple(scans)), primal, objects
 
 
-def test_chunks_give_the_labels_of_the_whole(long_street):
+def test_chunks_give_the_labels_of_the_whole_and_the_same_objects(long_street):
     scene, primal, objects = long_street
     largest = []
 
@@ -154,8 +96,24 @@ def test_chunks_give_the_labels_of_the_whole(long_street):
     np.testing.assert_array_equal(chunked.poses, whole.poses)
     differ = [(one.semantic != other.semantic).mean() for one, other in zip(chunked.labels, whole.labels, strict=True)]
     assert np.mean(differ) < 0.02
+    pairs = set()
+    for one, other in zip(chunked.labels, whole.labels, strict=True):
+        same = (one.semantic == other.semantic) & (one.semantic == CAR)
+        pairs |= set(zip(one.instance[same].tolist(), other.instance[same].tolist(), strict=True))
+    assert len(pairs) == len({one for one, _ in pairs}) == len({other for _, other in pairs}), "no id is cut or joined"
     for labels, truth in zip(chunked.labels, objects, strict=True):
         for car in range(1, 12):
             ids = labels.instance[(truth == car) & (labels.semantic == CAR)]
             if len(ids) > 30:
                 assert (ids == np.bincount(ids).argmax()).mean() > 0.95
+
+
+def test_in_chunks_too_the_published_rule_mends_each_scans_own_ids(long_street):
+    scene, primal, _ = long_street
+    refined = refine_scene(scene, primal, PAPER, sensor_height=1.7, max_points=30000).labels
+    changed = 0
+    for scan, before, after in zip(scene.scans, primal, refined, strict=True):
+        given = (before.semantic, before.instance, after.semantic)
+        np.testing.assert_array_equal(after.instance, correct_instances(scan.load_points().xyz, *given))
+        changed += ((after.semantic == CAR) & (before.semantic != CAR)).sum()
+    assert changed > 100, "the rule must have had something to do"

@@ -74,10 +74,11 @@ def scene(*scans):
         bounds.append(begin + len(ground))
         boxes.append(mine)
     semantic = np.concatenate(labels).astype(np.uint8)
+    points = np.concatenate(parts).astype(np.float32)
     arguments = (
-        np.concatenate(parts).astype(np.float32),
+        points,
         np.array(bounds),
-        semantic == ROAD,
+        points[semantic == ROAD],
         semantic,
         np.concatenate(primal).astype(np.uint8),
         np.zeros((len(scans), 3)),
@@ -214,7 +215,7 @@ def test_no_scans_empty_scans_and_scans_without_things():
     none = np.zeros(0, np.uint8)
     for scans in (0, 3):
         instance, semantic = scene_instances(
-            nothing, np.zeros(scans + 1, int), none > 0, none, none, np.zeros((scans, 3)), np.arange(scans) * 0.1
+            nothing, np.zeros(scans + 1, int), nothing, none, none, np.zeros((scans, 3)), np.arange(scans) * 0.1
         )
         assert len(instance) == len(semantic) == 0
     arguments, _ = scene([], [])
@@ -226,7 +227,7 @@ def test_single_points_and_points_without_place():
     points = np.array([[5, 0, 0], [np.nan, 0, 0], [np.inf, 1, 0], [30, 0, 0]], np.float32)
     semantic = np.full(4, CAR, np.uint8)
     instance, refined = scene_instances(
-        points, np.array([0, 2, 4]), np.zeros(4, bool), semantic, semantic, np.zeros((2, 3)), np.array([0, 0.1])
+        points, np.array([0, 2, 4]), points[:0], semantic, semantic, np.zeros((2, 3)), np.array([0, 0.1])
     )
     assert instance[[1, 2]].tolist() == [0, 0]
     assert (instance[[0, 3]] > 0).all()
@@ -272,13 +273,24 @@ def test_an_id_has_one_class_and_ids_run_from_one(scans):
     assert ((instance > 0) == ((arguments[3] >= 1) & (arguments[3] <= 10))).all()
 
 
+@given(small_scenes())
+def test_the_thing_points_alone_give_the_same_objects(scans):
+    arguments, _ = scene(*scans)
+    points, bounds, floor, semantic, primal, *rest = arguments
+    thing = np.flatnonzero(semantic != ROAD)
+    instance, refined = scene_instances(*arguments)
+    alone = scene_instances(points[thing], np.searchsorted(thing, bounds), floor, semantic[thing], primal[thing], *rest)
+    assert (alone[0] == instance[thing]).all()
+    assert (alone[1] == refined[thing]).all()
+
+
 @given(small_scenes(), st.integers(0, 2**32 - 1))
 def test_the_order_of_a_scans_points_does_not_matter(scans, seed):
     arguments, _ = scene(*scans)
-    points, bounds, ground, semantic, primal, *rest = arguments
+    points, bounds, floor, semantic, primal, *rest = arguments
     rng = np.random.default_rng(seed)
     order = np.concatenate([rng.permutation(np.arange(a, b)) for a, b in pairwise(bounds)])
     before = scene_instances(*arguments)
-    after = scene_instances(points[order], bounds, ground[order], semantic[order], primal[order], *rest)
+    after = scene_instances(points[order], bounds, rng.permutation(floor), semantic[order], primal[order], *rest)
     assert (after[0] == before[0][order]).all()
     assert (after[1] == before[1][order]).all()

@@ -22,7 +22,7 @@ def spots_of(*scans):
     points = np.concatenate(clouds).astype(np.float32)
     semantic = np.full(len(points), CAR, np.uint8)
     bounds = np.cumsum([0, *map(len, clouds)])
-    return find_spots(points, bounds, np.zeros(len(points), bool), semantic, semantic, np.zeros((len(scans), 3)))
+    return find_spots(points, bounds, points[:0], semantic, semantic, np.zeros((len(scans), 3)))
 
 
 def test_gaps_of_a_fragment_grow_with_the_distance():

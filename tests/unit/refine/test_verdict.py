@@ -5,7 +5,6 @@ import pytest
 
 from l3ps.labels.types import Provenance, ScanLabels
 from l3ps.presets import PRESETS
-from l3ps.refine.identify import Objects
 from l3ps.refine.verdict import Verdict, decide, of_objects
 from l3ps.taxonomy import NUSCENES16
 
@@ -17,7 +16,7 @@ def settled(before, after, instance, confidence=200):
     verdict = Verdict(
         np.array(before, np.uint8), np.full(n, confidence, np.uint8), np.full(n, Provenance.CAMERA, np.uint8)
     )
-    return of_objects(verdict, Objects(np.array(after, np.uint8), np.array(instance, np.int32)))
+    return of_objects(verdict, np.array(after, np.uint8), np.array(instance, np.int32))
 
 
 def test_a_point_whose_object_changed_its_class_is_as_sure_as_the_object_is_of_one_mind():

@@ -30,7 +30,7 @@ def after(scans, of, moves=True):
     semantic = points[:, 3].astype(np.uint8)
     bounds = np.cumsum([0, *map(len, clouds)])
     xyz, origins = points[:, :3].astype(np.float32), np.zeros((len(scans), 3))
-    spots = find_spots(xyz, bounds, np.zeros(len(points), bool), semantic, semantic, origins)
+    spots = find_spots(xyz, bounds, np.zeros((0, 3), np.float32), semantic, semantic, origins)
     before = np.array([of(scan, *xy) for scan, xy in zip(spots.scan, spots.xy, strict=True)])
     moving = np.broadcast_to(moves, before.max() + 1)[before]
     tracks = Tracks(before, np.broadcast_to(moves, before.max() + 1), moving)

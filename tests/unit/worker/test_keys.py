@@ -38,14 +38,14 @@ def test_segment_keys_tell_inputs_apart(change) -> None:
 
 
 def test_primal_labels_serve_every_refinement() -> None:
-    assert segment(preset=replace(BEST, instance_gap=9.0)) == segment()
+    assert segment(preset=replace(BEST, instance_class=False)) == segment()
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"primal_key": "x"},
-        {"preset": replace(BEST, instance_gap=9.0)},
+        {"preset": replace(BEST, instance_class=False)},
         {"formats": ["semantickitti"]},
         {"protocol": "paper"},
     ],
