@@ -294,3 +294,14 @@ def test_the_order_of_a_scans_points_does_not_matter(scans, seed):
     after = scene_instances(points[order], bounds, rng.permutation(floor), semantic[order], primal[order], *rest)
     assert (after[0] == before[0][order]).all()
     assert (after[1] == before[1][order]).all()
+
+
+def test_a_person_half_called_car_in_the_only_scan_is_no_car():
+    """More labels say car, but it is far short of one; the end of a car that all call car stays a car."""
+    person = [Box(CAR, 8, 6, 0.7, 0.3, 1.75), Box(PEDESTRIAN, 8, 6, 0.7, 0.18, 1.75)]
+    arguments, boxes = scene(person)
+    _, semantic = scene_instances(*arguments)
+    assert {int(c) for part in boxes[0] for c in semantic[part]} == {PEDESTRIAN}
+    arguments, boxes = scene([Box(CAR, 8, 6, 0.7, 0.5, 1.75)])
+    _, semantic = scene_instances(*arguments)
+    assert set(semantic[boxes[0][0]].tolist()) == {CAR}
