@@ -44,7 +44,7 @@ def ablate(
     scene: Annotated[str | None, typer.Option(help="Only this scene.")] = None,
     protocol: Annotated[str, typer.Option(help=f"{', '.join(PROTOCOLS)}.")] = "nuscenes",
     sizes: Annotated[bool, typer.Option("--sizes/--no-sizes", help="Also vary min_cluster_size.")] = True,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of each step.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, max=256, help="Threads of each step.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, in per cent.")] = False,
 ) -> None:
     """Refine the same primal labels with each component of `best` taken away in turn, and score every variant.

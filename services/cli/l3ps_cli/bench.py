@@ -37,7 +37,7 @@ def refine(
     scans: Annotated[int | None, typer.Option(min=1, help="Only the first scans of the scene.")] = None,
     scene: Annotated[str | None, typer.Option(help="This scene in place of the first.")] = None,
     preset: Annotated[str, typer.Option(help=f"{', '.join(PRESETS)}.")] = DEFAULT_PRESET,
-    threads: Annotated[int, typer.Option(min=1)] = 2,
+    threads: Annotated[int, typer.Option(min=1, max=256)] = 2,
     growth: Annotated[bool, typer.Option(help="Also 1, 2, 4, 8, 16 scans, as far as the scene has them.")] = True,
     peers: Annotated[bool, typer.Option(help="Also other packages' clustering; takes minutes.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,

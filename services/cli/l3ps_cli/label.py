@@ -63,7 +63,7 @@ def label(
     scene: Annotated[str | None, typer.Option(help="Only this scene.")] = None,
     skip_bad_scans: Annotated[bool, typer.Option("--skip-bad-scans", help="Label the good scans of a log.")] = False,
     protocol: Annotated[str | None, typer.Option(help="nuscenes, paper or semantickitti.")] = None,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of each step.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, max=256, help="Threads of each step.")] = 2,
 ) -> None:
     """Label every LiDAR point of a drive log; with truth in the log, score the labels too."""
     with clear_errors(), stopped_by_sigterm():

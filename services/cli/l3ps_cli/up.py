@@ -55,7 +55,7 @@ def up(
         int, typer.Option(min=0, max=65535, help="Port of the API on 127.0.0.1; 0 takes any free one.")
     ] = 8080,
     workers: Annotated[int, typer.Option(min=0, help="Worker processes; 0 for one per two cores.")] = 0,
-    threads: Annotated[int, typer.Option(min=1, help="Threads each worker process may use.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, max=256, help="Threads each worker process may use.")] = 2,
     token: Annotated[
         str | None, typer.Option(help="Bearer token the API demands.", envvar="L3PS_TOKEN", show_default=False)
     ] = None,

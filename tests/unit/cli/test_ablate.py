@@ -63,3 +63,9 @@ def test_an_unknown_protocol_is_refused(small_drive):
     result = run("--log", small_drive, "--protocol", "mine")
     assert result.exit_code == 2
     assert "there is no 'mine'" in result.output
+
+
+def test_threads_that_no_machine_has_are_refused(small_drive):
+    result = run("--log", small_drive, "--threads", 20_000)
+    assert result.exit_code == 2
+    assert "less than or equal to 256" in " ".join(result.output.split())
