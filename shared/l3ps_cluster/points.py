@@ -59,10 +59,12 @@ def as_count(value: int, name: str, least: int = 1) -> int:
         raise TypeError(f"{name}: expected a whole number, not {value!r}")
     if value < least:
         raise ValueError(f"{name}: expected {least} or more, not {value}")
+    if value > np.iinfo(np.int32).max:
+        raise ValueError(f"{name}: expected less than 2^31, not {value}")
     return int(value)
 
 
 def must_be_finite(points: NDArray[Any], name: str = "points") -> None:
-    """Raise ValueError unless every coordinate is a finite number."""
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: every coordinate must be a finite number")
+    """Raise ValueError unless every coordinate is a finite number below 1e15, as the C++ part does."""
+    if not (np.abs(points) < 1e15).all():
+        raise ValueError(f"{name}: every coordinate must be a finite number below 1e15")

@@ -73,7 +73,7 @@ def label(
             _choose(PROTOCOLS, protocol, "--protocol")
         if report is not None:
             report.parent.mkdir(parents=True, exist_ok=True)
-            report.touch()  # better to fail now than after the work
+            report.open("a").close()  # better to fail now than after the work
         started = time.perf_counter()
         segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
         with opened(log) as whole, _all_or_nothing(output) as staging:

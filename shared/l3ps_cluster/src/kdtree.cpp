@@ -88,6 +88,9 @@ Array<Point> load_points(const Real* from, std::size_t count, int dimensions, co
 
 }  // namespace
 
+// Beside a coordinate as large as this, float cannot tell others apart, and squares come near its limit.
+constexpr double LARGEST = 1e15;
+
 template <typename Real>
 Frame frame_of(const Real* points, std::size_t count, int dimensions, Team& team) {
     struct Bounds {
@@ -102,7 +105,7 @@ Frame frame_of(const Real* points, std::size_t count, int dimensions, Team& team
         for (std::size_t i = begin; i < end; ++i) {
             for (int axis = 0; axis < dimensions; ++axis) {
                 const double value = points[i * dimensions + axis];
-                part.finite &= std::isfinite(value);
+                part.finite &= std::abs(value) < LARGEST;  // false for what is not finite too
                 part.low[axis] = value < part.low[axis] ? value : part.low[axis];
                 part.high[axis] = value > part.high[axis] ? value : part.high[axis];
                 part.sum[axis] += value / double(count);
@@ -117,7 +120,8 @@ Frame frame_of(const Real* points, std::size_t count, int dimensions, Team& team
             for (const Bounds& part : parts) frame.centre[axis] += part.sum[axis];
         }
         for (const Bounds& part : parts) {
-            if (!part.finite) throw std::invalid_argument("points: every coordinate must be a finite number");
+            if (!part.finite) 
+                throw std::invalid_argument("points: every coordinate must be a finite number below 1e15");
             largest = std::max({largest, std::abs(part.low[axis] - frame.centre[axis]),
                                 std::abs(part.high[axis] - frame.centre[axis])});
         }

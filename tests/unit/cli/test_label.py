@@ -225,3 +225,10 @@ def test_what_cannot_work_is_said_before_the_work(small_drive, bundle, tmp_path,
     assert result.exit_code == 2, result.output
     assert expected in result.stderr
     assert not isinstance(result.exception, OSError | KeyError | ValueError)
+
+
+def test_a_report_that_is_a_folder_is_refused_before_the_work(small_drive, bundle, tmp_path):
+    result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o", "--report", tmp_path)
+    assert result.exit_code == 2
+    assert "Is a directory" in result.stderr
+    assert not (tmp_path / "o").exists()

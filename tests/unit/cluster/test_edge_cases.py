@@ -65,7 +65,7 @@ def test_utm_coordinates_keep_their_digits(rng):
     assert (moved.labels_ == here.labels_).mean() > 0.99
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e-12, 1e12, 1e30])
+@pytest.mark.parametrize("size", [1e-30, 1e-12, 1e12, 1e14])
 def test_any_unit_will_do(rng, size):
     """Squares that float32 cannot hold."""
     points = rng.normal(size=(500, 3)).astype(np.float32)
@@ -150,3 +150,23 @@ def test_the_functions_refuse_what_they_cannot_use():
             call()
     with pytest.raises(TypeError, match="labels: expected whole numbers"):
         fill_noise(points, np.zeros(4))
+
+
+def test_coordinates_that_float_cannot_hold_beside_others_are_refused(rng):
+    """One point at 1e30 among others crashed the search for neighbours."""
+    points = rng.random((1000, 3)).astype(np.float32)
+    points[0] = 1e30
+    labels = np.where(np.arange(1000) % 2, -1, 7)
+    for call in (
+        lambda: fill_noise(points, labels),
+        lambda: HDBSCAN().fit(points),
+        lambda: link(points, 0.1),
+        lambda: nearest(points, points[1:]),
+    ):
+        with pytest.raises(ValueError, match="finite number below 1e15"):
+            call()
+
+
+def test_a_count_beyond_what_there_can_be_is_refused():
+    with pytest.raises(ValueError, match="less than 2\\^31"):
+        HDBSCAN(min_cluster_size=2**40).fit(np.zeros((10, 3), np.float32))
