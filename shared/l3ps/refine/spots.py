@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+import l3ps_cluster
 from l3ps.refine.kinds import CLASSES, KIND_OF, KINDS
 from l3ps.taxonomy import NUSCENES16, VOID
 
@@ -146,11 +145,7 @@ def _scan_spots(
 
 def linked(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """(K,) number of each point's component in the graph of all pairs within a distance of 1."""
-    if len(points) == 0:
-        return np.zeros(0, dtype=np.intp)
-    pairs = cKDTree(points).query_pairs(1.0, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
+    return l3ps_cluster.link(points, 1.0, threads=1).astype(np.intp)
 
 
 def grouped(label: NDArray[np.integer], number: int) -> NDArray[np.intp]:
