@@ -78,6 +78,9 @@ def label(
         segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
         with opened(log) as whole, _all_or_nothing(output) as staging:
             drive = _checked(_limited(whole, scene), skip_bad_scans)
+            for one in drive.scenes:
+                if any(scan.load_truth is not None for scan in one.scans):
+                    evaluate_scene(drive, one, [], protocol or drive.truth_space)  # refuses what it could not score
             run = Run()
             for one in drive.scenes:
                 _label_scene(drive, one, segmenter, parameters, written_as, staging, run, protocol, threads)

@@ -232,3 +232,10 @@ def test_a_report_that_is_a_folder_is_refused_before_the_work(small_drive, bundl
     assert result.exit_code == 2
     assert "Is a directory" in result.stderr
     assert not (tmp_path / "o").exists()
+
+
+def test_a_protocol_that_the_truth_cannot_serve_is_refused_before_the_work(small_drive, bundle, tmp_path):
+    result = run("label", small_drive, "--model", bundle, "--out", tmp_path / "o", "--protocol", "semantickitti")
+    assert result.exit_code == 2
+    assert "which protocol semantickitti cannot score" in " ".join(result.stderr.split())
+    assert "segment" not in result.stderr, "no image was looked at"
