@@ -27,7 +27,7 @@ from l3ps.evaluate.estimates import ScanEstimate, estimate_scene
 from l3ps.labels.types import ScanLabels
 from l3ps.presets import Preset
 from l3ps.progress import Progress, silent
-from l3ps.refine.accumulate import deskew, transform
+from l3ps.refine.accumulate import transform
 from l3ps.refine.chunks import plan, progress_of
 from l3ps.refine.cluster import Clusterer, cluster_scene
 from l3ps.refine.ground import GroundSegmenter
@@ -180,9 +180,7 @@ def _vote(
     with book.span("accumulate"):
         points = np.empty((bounds[-1], 3), dtype=np.float32)
         for index, scan in enumerate(scans):
-            cloud = scan.load_points()
-            xyz = deskew(cloud.xyz, cloud.time, motion.velocity[index]) if preset.deskew else cloud.xyz
-            points[bounds[index] : bounds[index + 1]] = transform(xyz, motion.poses[index])
+            points[bounds[index] : bounds[index + 1]] = transform(scan.load_points().xyz, motion.poses[index])
         ground = np.concatenate(grounds)
 
     with book.span("cluster"):

@@ -74,9 +74,6 @@ class Preset:
         odometry: see :class:`Odometry`.
         poses: ``kiss-icp`` as published, unchecked; ``log`` takes the log's own where the scans agree with them, else
             KISS-ICP's, and cuts the scene where neither can be trusted (:mod:`l3ps.refine.poses`).
-        deskew: undo the LiDAR's own motion during a scan, where the log has point times. Off: on four simulated drives
-            (seeds 21 to 24, skewed at 4 to 7 m/s) it changed PQ by -1.0, +1.1, -0.1 and -4.7, as neighbouring scans
-            are skewed alike.
         min_cluster_size: HDBSCAN's s; 5 is the paper's best (its parameter study: 3 → 46.8, 5 → 48.1, 10 → 47.8 PQ).
         voxel: cluster centroids of cells of this edge in metres instead of points; None as published.
         voting: see :class:`Voting`.
@@ -92,7 +89,6 @@ class Preset:
     min_area: float = 500 / (1600 * 900)
     odometry: Odometry = Odometry()
     poses: Literal["kiss-icp", "log"] = "kiss-icp"
-    deskew: bool = False
     min_cluster_size: int = 5
     voxel: float | None = None
     voting: Voting = Voting()

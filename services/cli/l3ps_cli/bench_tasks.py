@@ -32,7 +32,7 @@ def refinement(folder: Path, root: str, scene: str, preset: str, threads: int, s
     """
     from l3ps.pipeline import refine_scene
     from l3ps.presets import PRESETS
-    from l3ps.refine import cluster
+    from l3ps.refine.cluster import exact_hdbscan
 
     drive, part, primal = _inputs(root, scene, scans)
     options = {"sensor_height": drive.sensor_height, "threads": threads}
@@ -51,7 +51,6 @@ def refinement(folder: Path, root: str, scene: str, preset: str, threads: int, s
         stages[name]["growth_mb"] = first.peak_mb - before
         stages[name]["bytes_a_point"] = (first.peak_mb - before) * 2**20 / points
     _save_partitions(folder, part, refined.poses, drive.sensor_height)
-    clusterer = getattr(cluster, "exact_hdbscan", cluster.hdbscan_package)  # what the pipeline takes by itself
     size = PRESETS[preset].min_cluster_size
     return {
         "scans": len(part.scans),
@@ -62,7 +61,7 @@ def refinement(folder: Path, root: str, scene: str, preset: str, threads: int, s
         "peak_mb": max(stage["peak_mb"] for stage in stages.values()),
         "growth_mb": max(stage["growth_mb"] for stage in stages.values()),
         "bytes_a_point": max(stage["bytes_a_point"] for stage in stages.values()),
-        "clustering": _median_seconds(lambda: [clusterer(own, size, threads) for own in _partitions(folder)]),
+        "clustering": _median_seconds(lambda: [exact_hdbscan(own, size, threads) for own in _partitions(folder)]),
     }
 
 

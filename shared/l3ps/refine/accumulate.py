@@ -6,14 +6,11 @@ serves one scene: carried over, it would register the next scene against a map o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
 from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from l3ps.errors import ProcessingError
 from l3ps.geometry import Matrix
@@ -21,9 +18,7 @@ from l3ps.presets import Odometry
 
 NO_TIMES = np.empty(0)
 """KISS-ICP reads an empty array as "do not deskew"; anything of another length than the scan fails, and equal times
-abort the process. Scans are deskewed here, before it sees them."""
-LONGEST_SWEEP = 1.0
-"""Seconds; point times that span more are of another unit."""
+abort the process."""
 
 
 class Odometer:
@@ -80,82 +75,12 @@ class Odometer:
         self(xyz)
 
 
-def estimate_poses(scans: Iterable[NDArray[np.float32]], odometry: Odometry) -> NDArray[np.float64]:
-    """Pose of each scan in the frame of the first; see :class:`Odometer`.
-
-    Args:
-        scans: per scan (N, 3) float32, metres, lidar frame, in time order; rows that are not finite are left out.
-        odometry: KISS-ICP's constants.
-
-    Returns:
-        (S, 4, 4) float64 lidar → scene.
-
-    Raises:
-        ProcessingError: when a scan has no point in range or a pose is not finite.
-    """
-    odometer = Odometer(odometry)
-    poses = [odometer(xyz) for xyz in scans]
-    return np.stack(poses) if poses else np.empty((0, 4, 4))
-
-
 def transform(xyz: NDArray[np.float32], pose: NDArray[np.float64]) -> NDArray[np.float32]:
     """Points (N, 3) float32 of the lidar frame in the frame that ``pose`` (4, 4) leads to.
 
     Computed in float64 and rounded once.
     """
     return (xyz.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-
-
-def twist(motion: Matrix, seconds: float) -> NDArray[np.float64]:
-    """Constant velocity that makes up a motion.
-
-    Args:
-        motion: (4, 4) rigid transform, the later pose in the frame of the earlier.
-        seconds: time between the two, > 0.
-
-    Returns:
-        (6,) float64: turn rate in rad/s, then speed in m/s, in the moving frame.
-    """
-    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    angle = float(np.linalg.norm(turn))
-    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
-    # Inverse of the left Jacobian (Solà et al. 2018, eq. 146); its limit is 1/12 where the angle vanishes.
-    bend = 1 / 12 if angle < 1e-4 else 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    speed = (np.eye(3) - cross / 2 + bend * cross @ cross) @ motion[:3, 3]
-    return np.concatenate([turn, speed]) / seconds
-
-
-def deskew(
-    xyz: NDArray[np.float32], time: NDArray[np.float64] | None, velocity: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Points as if all were measured at the scan's time stamp, under constant velocity.
-
-    Args:
-        xyz: (N, 3) float32, metres, lidar frame at each point's own time.
-        time: (N,) float64 seconds relative to the scan's time stamp; None, times that are all equal, not finite or
-            span more than a sweep can take leave the points as they are.
-        velocity: (6,) see :func:`twist`.
-
-    Returns:
-        (N, 3) float32, lidar frame at the scan's time stamp, in the same order.
-    """
-    if time is None or len(time) != len(xyz) or len(xyz) == 0 or not np.isfinite(time).all():
-        return xyz
-    if not 0 < np.ptp(time) <= LONGEST_SWEEP or np.abs(time).max() > LONGEST_SWEEP:
-        return xyz
-    turn, speed = velocity[:3], velocity[3:]
-    rate = float(np.linalg.norm(turn))
-    # Exponential map of se(3): along x(t) = R(t) x + p(t) with both in closed form (Solà et al. 2018, eq. 145 and 172).
-    axis = turn / rate if rate > 1e-9 else np.zeros(3)
-    angle = rate * time
-    sin, cos = np.sin(angle)[:, None], np.cos(angle)[:, None]
-    along = np.cross(axis, speed)
-    straight = time[:, None] * speed
-    if rate > 1e-9:
-        straight += (1 - cos) / rate * along + (time[:, None] - sin / rate) * np.cross(axis, along)
-    points = xyz.astype(np.float64)
-    turned = points * cos + np.cross(axis, points) * sin + np.outer(points @ axis, axis) * (1 - cos)
-    return np.asarray(turned + straight, dtype=np.float32)
 
 
 def _config(odometry: Odometry) -> KISSConfig:

@@ -24,7 +24,7 @@ from l3ps.drivelog.types import Points, Scene
 from l3ps.errors import Problem
 from l3ps.geometry import Matrix, invert, is_rigid
 from l3ps.presets import Preset
-from l3ps.refine.accumulate import Odometer, deskew, twist
+from l3ps.refine.accumulate import Odometer
 from l3ps.refine.overlap import Fit, Standing, fit, search, standing
 
 WORSE, SLACK = 1.1, 0.005
@@ -55,7 +55,6 @@ class Motion:
         residual: (S,) float64 metres between a scan and the one before it, see :class:`~l3ps.refine.overlap.Fit`; NaN
             where it cannot be told and for the first.
         overlap: (S,) float64 share, likewise.
-        velocity: (S, 6) float64, see :func:`~l3ps.refine.accumulate.twist`; 0 where it is not known.
         problems: what is wrong with the poses; all are warnings.
     """
 
@@ -64,14 +63,12 @@ class Motion:
     starts: tuple[int, ...]
     residual: NDArray[np.float64]
     overlap: NDArray[np.float64]
-    velocity: NDArray[np.float64]
     problems: tuple[Problem, ...] = ()
 
     def part(self, first: int, stop: int) -> Motion:
         """The motion through some consecutive scans, in the same frame; problems stay with the whole."""
         own = slice(first, stop)
-        parts = (self.residual[own], self.overlap[own], self.velocity[own])
-        return Motion(self.poses[own], self.source, (0,), *parts)
+        return Motion(self.poses[own], self.source, (0,), self.residual[own], self.overlap[own])
 
 
 class PoseTracker:
@@ -91,7 +88,6 @@ class PoseTracker:
         self._fits: dict[str, list[Fit]] = {"kiss-icp": [], "log": []}
         self._poses: list[Matrix] = []
         self._moving = False  # whether the last motion tells the next
-        self._scans = 0
 
     def add(self, points: Points) -> None:
         """Register the next scan.
@@ -99,18 +95,14 @@ class PoseTracker:
         Raises:
             ProcessingError: when the scan has no point in range or the odometry diverges.
         """
-        index, checked = self._scans, self._preset.poses == "log"
-        self._scans += 1
+        checked = self._preset.poses == "log"
         xyz = points.xyz
-        if self._preset.deskew and index > 1:
-            velocity = twist(self._steps["kiss-icp"][-1], seconds(self._scene, index))
-            xyz = deskew(xyz, points.time, velocity)
         here, before = standing(xyz), self._last
         self._last = here
         if before is None:
             self._poses.append(self._odometer(xyz))
             return
-        log = None if self._log is None else self._log[index - 1]
+        log = None if self._log is None else self._log[len(self._poses) - 1]
         if checked:
             last = self._odometer.step if self._moving else None
             self._odometer.predict(_predicted(before, here, last, log))
@@ -164,14 +156,13 @@ class PoseTracker:
                 remedy = f"The scene was refined in parts, cut before this scan. {remedy}"
             problems.append(self._warning("odometry-failed", what, remedy, int(pair) + 1))
         published = self._preset.poses == "kiss-icp"  # the product of its steps differs in the last digit
-        poses = np.array(self._poses).reshape(-1, 4, 4) if published else _chained(steps)[: self._scans]
+        poses = np.array(self._poses).reshape(-1, 4, 4) if published else _chained(steps)[: len(self._poses)]
         return Motion(
             poses,
             source,
             tuple(starts),
-            np.concatenate([[np.nan], residual])[: self._scans],
-            np.concatenate([[np.nan], overlap])[: self._scans],
-            velocities(self._scene, steps, lost)[: self._scans],
+            np.concatenate([[np.nan], residual])[: len(self._poses)],
+            np.concatenate([[np.nan], overlap])[: len(self._poses)],
             tuple(problems),
         )
 
@@ -218,31 +209,6 @@ def log_steps(scene: Scene) -> list[Matrix] | None:
             return None
         poses.append(scan.ego_to_world @ scan.lidar_to_ego)
     return [invert(before) @ after for before, after in pairwise(poses)]
-
-
-def seconds(scene: Scene, index: int) -> float:
-    """Time between a scan and the one before it; infinite where the time stamps do not tell."""
-    microseconds = scene.scans[index].timestamp - scene.scans[index - 1].timestamp
-    return microseconds / 1e6 if microseconds > 0 else np.inf
-
-
-def velocities(scene: Scene, steps: NDArray[np.float64], lost: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Velocity at each scan: mean of the motion to it and from it.
-
-    Args:
-        scene: the scene.
-        steps: (S - 1, 4, 4) motion from each scan to the next.
-        lost: (S - 1,) steps that are not known.
-
-    Returns:
-        (S, 6) float64, see :func:`~l3ps.refine.accumulate.twist`; 0 where no step is known.
-    """
-    total = np.zeros((len(steps) + 1, 6))
-    count = np.zeros((len(steps) + 1, 1))
-    for index in np.flatnonzero(~lost):
-        total[index : index + 2] += twist(steps[index], seconds(scene, int(index) + 1))
-        count[index : index + 2] += 1
-    return total / np.maximum(count, 1)
 
 
 def _predicted(before: Standing, here: Standing, last: Matrix | None, log: Matrix | None) -> Matrix:

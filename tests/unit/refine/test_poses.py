@@ -8,7 +8,6 @@ import pytest
 from l3ps.drivelog.types import Points, Scan, Scene
 from l3ps.geometry import invert, transform
 from l3ps.presets import BEST, PAPER
-from l3ps.refine.accumulate import deskew, twist
 from l3ps.refine.accumulate import transform as moved
 from l3ps.refine.overlap import fit, standing
 from l3ps.refine.poses import PoseTracker, log_steps
@@ -168,39 +167,3 @@ def test_a_wrong_motion_fits_worse_the_more_it_is_wrong():
     fits = [fit(one, other, transform(np.eye(3), [0, off, 0]) @ motion()) for off in (0, 0.3, 1, 3)]
     assert fits[0].residual < fits[1].residual < fits[2].residual
     assert fits[0].overlap > 0.8 > fits[1].overlap > fits[2].overlap > fits[3].overlap
-
-
-@pytest.mark.parametrize("turn", [0.0, 1e-7, 0.3, -1.2])
-def test_deskewing_undoes_the_motion_during_a_sweep(turn):
-    whole = motion(2.0, turn)
-    velocity = twist(whole, 0.5)
-    world = np.random.default_rng(2).uniform(-30, 30, (200, 3)).astype(np.float32)
-    time = np.linspace(-0.25, 0.5, 200)
-    seen = np.concatenate([moved(world[i : i + 1], invert(_after(whole, t / 0.5))) for i, t in enumerate(time)])
-    np.testing.assert_allclose(deskew(seen, time, velocity), world, atol=2e-4)
-    np.testing.assert_allclose(deskew(world[:1], np.array([0.4]), velocity), world[:1])
-
-
-def _after(whole, share):
-    """The motion after a share of the time at constant velocity, by many small steps."""
-    from scipy.linalg import expm, logm
-
-    return np.real(expm(np.real(logm(whole)) * share))
-
-
-@pytest.mark.parametrize(
-    "time",
-    [
-        None,
-        np.zeros(3),
-        np.full(3, 0.07),
-        np.array([0, np.nan, 0.1]),
-        np.array([0, 5e4, 1e5]),
-        np.array([0.0, 0.1]),
-        1e9 + np.array([0, 0.05, 0.1]),
-    ],
-    ids=["none", "zero", "equal", "nan", "microseconds", "too few", "absolute"],
-)
-def test_times_that_cannot_be_are_left_alone(time):
-    xyz = np.arange(9, dtype=np.float32).reshape(3, 3)
-    np.testing.assert_array_equal(deskew(xyz, time, twist(motion(), 0.1)), xyz)
