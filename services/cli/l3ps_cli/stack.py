@@ -26,7 +26,8 @@ from typing import Any
 
 import httpx
 
-from l3ps_cli.processes import Processes, StopPlan
+from l3ps_cli.processes import Processes
+from l3ps_platform.processes import StopPlan
 
 READY_SECONDS = 60.0
 """The API answers after 2–3 s on two idle cores; the rest is for a machine that is busy or reads a cold disk."""

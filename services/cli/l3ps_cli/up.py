@@ -77,7 +77,7 @@ def up(
     except StopRequested:
         out.print("l3ps has stopped.")
     except ChildDiedError as error:
-        fail(f"{error}. Everything else was stopped too. Its last lines:\n{error.child.last_lines()}", JOB_FAILED)
+        fail(f"{error}. Everything else was stopped too. Its last lines:\n{error.last_lines}", JOB_FAILED)
     except (StackError, TimeoutError) as error:
         fail(str(error), JOB_FAILED)
 

@@ -25,10 +25,10 @@ from celery import signals  # noqa: E402
 from l3ps_platform import workflow  # noqa: E402
 from l3ps_platform.catalog import Catalog, stages  # noqa: E402
 from l3ps_platform.errors import PlatformError  # noqa: E402
+from l3ps_platform.processes import die_with  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
-from l3ps_worker.processes import die_with  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
 
