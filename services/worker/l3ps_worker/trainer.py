@@ -27,7 +27,7 @@ LOG_BYTES = 256 << 10
 _LINE_BYTES = 4 << 20
 """Longer lines are no events: the longest, a report with its classes, has some ten thousand bytes."""
 _TICK_SECONDS = 0.2
-_LEAVE_SECONDS = 15.0
+LEAVE_SECONDS = 15.0
 """For finishing a step of the training and writing a checkpoint; a step over ViT-L takes seconds on a CPU."""
 
 Event = dict[str, Any]
@@ -87,9 +87,9 @@ class Trainer:
             yield None
         yield from self._rest()
 
-    def stop(self, seconds: float = _LEAVE_SECONDS) -> None:
-        """Have it write a checkpoint and leave, and kill its whole process group if it does not."""
-        deadline = time.monotonic() + seconds
+    def stop(self, seconds: float | None = None) -> None:
+        """Have it write a checkpoint and leave, and kill its whole process group if it does not in time."""
+        deadline = time.monotonic() + (LEAVE_SECONDS if seconds is None else seconds)
         if self.child.running():
             os.kill(self.child.pid, signal.SIGTERM)
         # It could not leave while it waits for somebody to read what it says.
