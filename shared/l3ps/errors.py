@@ -4,7 +4,8 @@
     ├── InputError            the caller's data is at fault; the message says what, where and what to do
     │   ├── DriveLogError     an archive or a drive log (carries every problem found, not only the first)
     │   ├── ModelError        a model bundle
-    │   └── LabelError        label files
+    │   ├── LabelError        label files
+    │   └── AnnotationError   annotated images to train from (carries every problem found, up to a bound)
     ├── ProcessingError       a stage could not do its work on valid input (odometry diverged, …)
     └── Cancelled             the caller asked to stop
 
@@ -73,6 +74,10 @@ class ModelError(InputError):
 
 class LabelError(InputError):
     """Label files cannot be used."""
+
+
+class AnnotationError(InputError):
+    """Annotated images cannot be used."""
 
 
 class ProcessingError(L3psError):

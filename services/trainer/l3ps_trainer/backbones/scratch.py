@@ -1,4 +1,4 @@
-"""A small panoptic network: one encoder, one decoder, two heads.
+"""A small encoder and decoder, trained whole: the one backbone that needs no pretrained weights.
 
 Residual stages at 1/4, 1/8 and 1/16, a pooled context vector, and a top-down decoder to 1/2 that
 narrows where the map is large. Plain 3×3 convolutions
@@ -7,10 +7,19 @@ where channels are few, separable ones where they are many: on a CPU that is the
 
 from __future__ import annotations
 
-import torch
+import copy
+
 from torch import Tensor, nn
 from torch.nn import functional as f
 
+from l3ps.errors import ModelError, Problem
+from l3ps.segment.bundle import InputSpec
+
+from .base import Backbone
+
+MEAN, STD = (0.45, 0.45, 0.45), (0.25, 0.25, 0.25)
+"""Normalisation of RGB in 0..1."""
+COARSEST = 16
 STEM, QUARTER, EIGHTH, SIXTEENTH, DECODER, FINE = 16, 32, 72, 144, 48, 24
 
 
@@ -62,19 +71,33 @@ class Separable(nn.Module):
         return out
 
 
-class PanopticNet(nn.Module):
-    """Images to class logits and boundary map, both at the input's resolution.
+class Scratch(Backbone):
+    """Images to a narrow feature map at half their size.
 
     Args:
-        classes: number of classes of the semantic head.
+        size: (height, width) of the input, multiples of 16.
         width: multiplies every channel count; tests use less than 1.
+
+    Raises:
+        ModelError: the size is no multiple of 16.
     """
 
-    def __init__(self, classes: int, width: float = 1.0) -> None:
+    trainable = True
+    name = "scratch"
+    identity = "untrained"
+    stride = 2
+
+    def __init__(self, size: tuple[int, int], width: float = 1.0) -> None:
         super().__init__()
+        if size[0] % COARSEST or size[1] % COARSEST:
+            what = f"the encoder halves its input four times, and {size[0]}x{size[1]} is no multiple of {COARSEST}"
+            near = "x".join(str(max(1, round(s / COARSEST)) * COARSEST) for s in size)
+            raise ModelError(Problem("bad-size", "--size", what, f"Take {near}."))
+        self.spec = InputSpec(name="image", height=size[0], width=size[1], mean=MEAN, std=STD)
         stem, quarter, eighth, sixteenth, decoder, fine = (
             max(8, int(c * width)) for c in (STEM, QUARTER, EIGHTH, SIXTEENTH, DECODER, FINE)
         )
+        self.channels = fine
         self.stem = Conv(3, stem, stride=2)
         self.quarter = nn.Sequential(Conv(stem, quarter, stride=2), Residual(quarter))
         self.eighth = nn.Sequential(Conv(quarter, eighth, stride=2), Residual(eighth), Separable(eighth, 2))
@@ -87,12 +110,9 @@ class PanopticNet(nn.Module):
         self.narrow = nn.Conv2d(decoder, fine, 1)
         self.detail = nn.Conv2d(stem, fine, 1)
         self.last = Conv(fine, fine)
-        self.semantic = nn.Conv2d(fine, classes, 1)
-        self.boundary = nn.Sequential(nn.Conv2d(fine, 4, 1), nn.PixelShuffle(2))
 
-    def heads(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`forward`, but the logits at half the input's resolution, which is where they are made."""
-        half = self.stem(image)
+    def forward(self, images: Tensor) -> Tensor:
+        half = self.stem(images)
         quarter = self.quarter(half)
         eighth = self.eighth(quarter)
         sixteenth = self.sixteenth(eighth)
@@ -100,17 +120,11 @@ class PanopticNet(nn.Module):
         x = self.laterals[0](sixteenth)
         x = self.smooth[0](_doubled(x) + self.laterals[1](eighth))
         x = self.smooth[1](_doubled(x) + self.laterals[2](quarter))
-        x = self.last(_doubled(self.narrow(x)) + self.detail(half))
-        return self.semantic(x), torch.sigmoid(self.boundary(x))
+        out: Tensor = self.last(_doubled(self.narrow(x)) + self.detail(half))
+        return out
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Label images.
-
-        Args:
-            image: (B, 3, H, W) normalised; H and W multiples of 16.
-
-        Returns:
-            (B, C, H, W) class logits and (B, 1, H, W) probability of lying inside a segment.
-        """
-        semantic, boundary = self.heads(image)
-        return _doubled(semantic), boundary
+    def at(self, size: tuple[int, int]) -> Scratch:
+        """The same weights for another input: nothing in it depends on the size."""
+        other = copy.copy(self)  # shares the weights
+        other.spec = self.spec.model_copy(update={"height": size[0], "width": size[1]})
+        return other

@@ -1,0 +1,138 @@
+"""Any ONNX graph that returns a feature map, as a frozen backbone."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+from l3ps.errors import ModelError, Problem
+from l3ps.segment.bundle import InputSpec
+
+from .base import Backbone, input_spec
+
+_REMEDY = "Name a graph that takes one image (1, 3, H, W) and returns one feature map (1, D, h, w), all sizes fixed."
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """One file: its input and the shape of its feature map."""
+
+    path: Path
+    image: str
+    output: str
+    size: tuple[int, int]
+    channels: int
+    stride: int
+
+
+class OnnxGraph(Backbone):
+    """A graph run by ONNX Runtime on the CPU.
+
+    Args:
+        path: of one graph, or of a folder of graphs of several sizes.
+        size: (height, width) wanted, or None for the graph whose aspect comes nearest to ``aspect``, of several the
+            smallest.
+        aspect: width / height of the images.
+        threads: of one operator.
+
+    Raises:
+        ModelError: there is no such graph, or it returns no feature map.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int] | None, aspect: float = 16 / 9, threads: int = 2) -> None:
+        super().__init__()
+        self._path, self._threads = path, threads
+        chosen = _chosen(_graphs(path), size, aspect)
+        self.name = f"onnx:{path.name}/{chosen.path.name}" if path.is_dir() else f"onnx:{path.name}"
+        self.file, self.output, self.channels, self.stride = chosen.path, chosen.output, chosen.channels, chosen.stride
+        self.spec = _spec(chosen)
+        self.identity = hashlib.sha256(chosen.path.read_bytes()).hexdigest()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(str(chosen.path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
+            raise _wrong(chosen.path, f"onnxruntime cannot load it ({str(error).splitlines()[0][:160]})") from error
+
+    def forward(self, images: Tensor) -> Tensor:
+        single = images.detach().cpu().numpy()
+        maps = [self._session.run([self.output], {self.spec.name: image[None]})[0] for image in single]
+        return torch.from_numpy(np.concatenate(maps)).to(images.device)
+
+    def at(self, size: tuple[int, int]) -> OnnxGraph:
+        """The graph of the same folder that has this input."""
+        return OnnxGraph(self._path, size, threads=self._threads)
+
+
+def _graphs(path: Path) -> list[_Graph]:
+    files = sorted(path.glob("*.onnx")) if path.is_dir() else [path]
+    if not files or not files[0].is_file():
+        raise _wrong(path, "there is no ONNX graph")
+    return [_read(file) for file in files]
+
+
+def _read(file: Path) -> _Graph:
+    try:
+        graph = onnx.load(file, load_external_data=False).graph
+    except Exception as error:  # protobuf raises its own kinds
+        raise _wrong(file, "it is no ONNX graph") from error
+    weights = {tensor.name for tensor in graph.initializer}
+    inputs = [i for i in graph.input if i.name not in weights]
+    shapes = [[d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*inputs, *graph.output)]
+    if len(inputs) != 1 or len(graph.output) != 1:
+        raise _wrong(file, f"it has {len(inputs)} inputs and {len(graph.output)} outputs")
+    image, features = shapes
+    if len(image) != 4 or image[:2] != [1, 3] or min(image) < 1:
+        raise _wrong(file, f"its input is {image}")
+    if len(features) != 4 or features[0] != 1 or min(features) < 1:
+        raise _wrong(file, f"its output is {features}")
+    return _Graph(
+        file,
+        inputs[0].name,
+        graph.output[0].name,
+        (image[2], image[3]),
+        features[1],
+        max(1, round(image[3] / features[3])),
+    )
+
+
+def _chosen(graphs: list[_Graph], size: tuple[int, int] | None, aspect: float) -> _Graph:
+    if size is None:
+        return min(graphs, key=lambda g: (round(abs(np.log(g.size[1] / g.size[0] / aspect)), 2), g.size))
+    for graph in graphs:
+        if graph.size == size:
+            return graph
+    known = ", ".join(f"{g.size[0]}x{g.size[1]}" for g in graphs)
+    what = f"there is no graph for an input of {size[0]}x{size[1]}"
+    raise ModelError(Problem("bad-size", str(graphs[0].path.parent), what, f"There are: {known}."))
+
+
+def _spec(graph: _Graph) -> InputSpec:
+    """ImageNet's normalisation, unless the JSON beside the graph says otherwise."""
+    usual = input_spec(graph.size).model_copy(update={"name": graph.image})
+    beside = graph.path.with_suffix(".json")
+    if not beside.is_file():
+        return usual
+    try:
+        told = json.loads(beside.read_text())
+        return InputSpec.model_validate(
+            usual.model_dump() | {k: told[k] for k in ("mean", "std", "range") if k in told}
+        )
+    except (ValueError, TypeError, ValidationError) as error:
+        what = f"it does not tell mean, std and range ({' '.join(str(error).split())[:160]})"
+        raise ModelError(Problem("bad-model-json", str(beside), what, "Correct or remove the file.")) from error
+
+
+def _wrong(path: Path, what: str) -> ModelError:
+    return ModelError(Problem("bad-backbone", str(path), what, _REMEDY))
