@@ -22,7 +22,7 @@ def submit_training(
     name: Annotated[str, typer.Option(help="What the model is to be called.")],
     backbone: Annotated[str, typer.Option(help="A backbone that the service has, or scratch.")],
     validation: Annotated[
-        Path | None, typer.Option(help="Annotated images to measure on; default: some are set aside.")
+        str | None, typer.Option(help="Annotated images to measure on, or a share to set aside such as 0.2.")
     ] = None,
     recipe: Annotated[str | None, typer.Option(help="Name of a recipe.", show_default=False)] = None,
     classes: Annotated[Path | None, typer.Option(help="JSON file that says what the numbers mean.")] = None,
@@ -41,9 +41,10 @@ def submit_training(
     Exit codes: 0 done, 1 the training failed, 2 bad input, 3 the service cannot be reached.
     """
     with service_errors(), Client() as client:
-        for path in (annotations, validation):
-            if path is not None:
-                check_log(path, "annotated images")
+        check_log(annotations, "annotated images")
+        measured = _share(validation)
+        if isinstance(measured, Path):
+            check_log(measured, "annotated images or a share")
         request: dict[str, Any] = {"name": name, "backbone": backbone, "format": format, "seed": seed, "int8": int8}
         given = {
             "recipe": recipe,
@@ -52,11 +53,12 @@ def submit_training(
             "size": _size("--size", size),
             "balanced": _size("--balanced", balanced),
             "epochs": epochs,
+            "validation": measured if isinstance(measured, float) else None,
         }
         request |= {field: value for field, value in given.items() if value is not None}
         request["annotations"] = upload_log(client, annotations, "annotations")["id"]
-        if validation is not None:
-            request["validation"] = upload_log(client, validation, "annotations")["id"]
+        if isinstance(measured, Path):
+            request["validation"] = upload_log(client, measured, "annotations")["id"]
         training = client.post("/models/train", request)
         if wait:
             try:
@@ -83,6 +85,14 @@ def _require_success(training: dict[str, Any]) -> None:
         why = {"detail": f"Training {training['id']} failed. {training.get('message') or ''}"}
         errors = training.get("errors")
         fail("\n".join(sentences(why | {"errors": errors})), BAD_INPUT if errors else JOB_FAILED)
+
+
+def _share(validation: str | None) -> Path | float | None:
+    """A share of the images, or where others are."""
+    try:
+        return float(validation or "")
+    except ValueError:
+        return None if validation is None else Path(validation)
 
 
 def _classes(path: Path) -> Any:

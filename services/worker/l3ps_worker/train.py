@@ -26,7 +26,7 @@ from l3ps_worker.work import Done, check_sha256, download, sha256_of, unpack_lim
 
 log = structlog.get_logger(__name__)
 
-STEPS = {"fetch": 0.02, "unpack": 0.02, "features": 0.2, "train": 0.6, "validate": 0.08, "export": 0.08}
+STEPS = {"fetch": 0.02, "unpack": 0.02, "features": 0.2, "train": 0.6, "export": 0.06, "validate": 0.1}
 """The steps of a training, each with its share of the work."""
 
 _FOLDERS_AROUND = 3

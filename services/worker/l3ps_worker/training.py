@@ -29,7 +29,7 @@ _BAD_INPUT = 2
 _USELESS_CHECKPOINT = ("bad-checkpoint", "other-settings")
 """What the trainer says of a checkpoint that it does not go on from."""
 _LOG_SECONDS = 5.0
-_OPTIONS = ("recipe", "format", "images", "size", "balanced", "epochs", "seed")
+_OPTIONS = ("recipe", "format", "images", "validation", "size", "balanced", "epochs", "seed")
 """Settings that are options of the trainer under the same name."""
 
 
@@ -138,9 +138,7 @@ class TrainingRun:
                 began = self._began.setdefault(step, time.monotonic())
                 self.steps[step] = (time.monotonic() - began, trainer.peak_mb())
                 self._figures |= _figures(event)
-                # In the midst of the training `validate` is a look at how it goes, not the step behind it.
-                if step != "validate" or self._at[0] != "train" or self._at[1] >= self._at[2]:
-                    self._at = (step, done, total)
+                self._at = (step, done, total)
             case {"event": "done", "report": dict(report)}:
                 self._report = report
             case {"event": "error", "problems": [*problems]}:
@@ -219,6 +217,7 @@ class TrainingRun:
                 where, what = where.replace(path, known), what.replace(path, known)
             if where == name or where.startswith(f"{name}/"):
                 where = known + where.removeprefix(name)
+        where = where.removeprefix("--")  # options have the names of the request's fields
         return Problem(problem.code, where, what, problem.remedy, problem.severity, problem.scene, problem.scan)
 
 

@@ -27,7 +27,7 @@ def submit_training(
         name: what the model is to be called.
         annotations_id: what to learn from.
         settings: for the trainer, as :class:`~l3ps_platform.catalog.TrainingRow` keeps them.
-        validation_id: what to measure on; None: the trainer sets some of the annotations aside.
+        validation_id: what to measure on, if other annotations.
 
     Raises:
         NotFound: no such annotations.

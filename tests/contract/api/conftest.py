@@ -29,6 +29,13 @@ MiB = 1 << 20
 TUNING = {"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"}
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what costs seconds where it would only cost them twice."""
+    twice = [item for item in items if item.get_closest_marker("once") and item.callspec.params["service"] != "servers"]
+    items[:] = [item for item in items if item not in twice]
+    config.hook.pytest_deselected(items=twice)
+
+
 @dataclass
 class Service:
     """A running service as a client sees it, with its catalog and object store for looking behind the curtain."""

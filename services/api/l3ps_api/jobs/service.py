@@ -15,7 +15,7 @@ from l3ps_platform.workflow import cancel_job, submit_job
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
-    *("features", "train", "validate", "export"),
+    *("features", "train", "export", "validate"),
 )
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
 

@@ -48,14 +48,14 @@ class TrainingSettings(BaseModel):
     recipe: Word | None = Field(default=None, description="Name of a recipe: head, loss, augmentation and schedule.")
     format: AnnotationFormat = Field(default="auto", description="Of the annotations; `auto` looks at the files.")
     classes: Classes | None = None
-    images: int | None = Field(default=None, ge=1, le=1_000_000, description="Learn from so many of the images.")
+    images: int | None = Field(default=None, ge=1, le=1_000_000, description="Learn from so many, spread over all.")
     size: tuple[Side, Side] | None = Field(default=None, description="Height and width of the network's input.")
     balanced: tuple[Side, Side] | None = Field(
         default=None, description="A second, larger input for the preset `balanced`: height and width."
     )
     epochs: int | None = Field(default=None, ge=1, le=100_000)
     seed: int = Field(default=0, ge=0, lt=1 << 31)
-    int8: bool = Field(default=False, description="Quantise, and keep it where the validation loses next to nothing.")
+    int8: bool = Field(default=False, description="Quantise, and keep that where validation allows it.")
 
 
 class TrainingRequest(TrainingSettings):
@@ -63,8 +63,10 @@ class TrainingRequest(TrainingSettings):
 
     name: ModelName = Field(description="What the model is to be called.")
     annotations: str = Field(max_length=40, description="Id of annotations, or of the upload they came as.")
-    validation: str | None = Field(
-        default=None, max_length=40, description="The same, to measure on; default: some images are set aside for it."
+    validation: Annotated[float, Field(gt=0, lt=1)] | Annotated[str, Field(max_length=40)] | None = Field(
+        default=None,
+        description="What to measure on: the same, or a share of the images to set aside. Without it nothing is "
+        "measured, and how good the model is remains unknown.",
     )
 
 

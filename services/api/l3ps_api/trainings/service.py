@@ -37,10 +37,13 @@ def create(services: Services, request: TrainingRequest) -> Training:
         raise ApiProblem(503, "training-unavailable", "This service does not train", _UNAVAILABLE)
     fields = set(TrainingSettings.model_fields)
     settings = request.model_dump(mode="json", include=fields, exclude_none=True)
+    measured = request.validation
+    if isinstance(measured, float):
+        settings["validation"] = measured
     try:
         with services.catalog.transaction() as tx:
             annotations_id = _annotations(tx.session, "annotations", request.annotations)
-            validation_id = _annotations(tx.session, "validation", request.validation) if request.validation else None
+            validation_id = _annotations(tx.session, "validation", measured) if isinstance(measured, str) else None
             row = submit_training(
                 tx, name=request.name, annotations_id=annotations_id, validation_id=validation_id, settings=settings
             )
