@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from l3ps.errors import AnnotationError, DriveLogError
+from l3ps.simulate import annotated_images, simulate_images
 from l3ps_trainer.annotations import (
     NUSCENES_AND_SKY,
     Annotated,
@@ -105,3 +106,13 @@ def test_class_zero_is_void():
     for names, targets in ((("car",), (4,)), (("void", "a", "a"), (0, 1, 1)), (("void", "a"), (0,))):
         with pytest.raises(ValueError):
             ClassSet(names, targets)
+
+
+def test_simulated_images_are_annotations(tmp_path):
+    simulate_images(tmp_path / "set", count=2, seed=5, width=64)
+    found = open_annotations(tmp_path / "set")
+    assert found.classes == NUSCENES_AND_SKY and found.has_instances
+    for image, drawn in zip(found.images, annotated_images(2, 5, width=64), strict=True):
+        read = image.load()
+        assert (read.rgb == drawn.rgb).all() and (read.semantic == drawn.semantic).all()
+        assert (read.instance == drawn.instance).all()
