@@ -12,8 +12,12 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-COMMANDS = ("label", "evaluate", "draw", "simulate", "bench", "ablate", "up", "submit", "jobs", "download", "demo")
-"""In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands."""
+COMMANDS = (
+    "label", "evaluate", "draw", "simulate", "simulate-images", "bench", "ablate", "up", "submit", "jobs", "download",
+    "demo",
+)  # fmt: skip
+"""In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands; a
+hyphen of the name is an underscore there."""
 
 
 class _OnDemand(TyperGroup):
@@ -27,13 +31,14 @@ class _OnDemand(TyperGroup):
         """One command, or None when there is none of that name."""
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"l3ps_cli.{cmd_name}")
+        name = cmd_name.replace("-", "_")
+        module = import_module(f"l3ps_cli.{name}")
         if hasattr(module, "app"):
             group = typer.main.get_group(module.app)
             group.name = cmd_name
             return group
         alone = typer.Typer(add_completion=False)
-        alone.command(cmd_name)(getattr(module, cmd_name))
+        alone.command(cmd_name)(getattr(module, name))
         return typer.main.get_command(alone)
 
 
