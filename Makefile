@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench lint format setup setup-dev servers compose-check demo-model clean
+.PHONY: help demo test bench lint format setup setup-dev setup-trainer servers compose-check demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,6 +31,9 @@ servers: setup-dev
 
 setup: $(UV)
 	$(UV) sync --frozen --inexact --no-dev --package l3ps-cli --package l3ps-api --package l3ps-worker
+
+setup-trainer: setup ## what `l3ps train` needs: torch, about 3 GB
+	$(UV) sync --frozen --inexact --no-dev --package l3ps-trainer
 
 setup-dev: $(UV)
 	$(UV) sync --frozen --all-packages

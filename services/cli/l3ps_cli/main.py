@@ -13,13 +13,11 @@ import typer
 from typer.core import TyperGroup
 
 COMMANDS = (
-    *("label", "evaluate", "draw", "simulate", "bench", "ablate", "up", "submit", "jobs", "download"),
-    *("submit-training", "trainings", "demo"),
-)
-"""In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands.
-
-A dash is an underscore there.
-"""
+    "label", "evaluate", "draw", "simulate", "simulate-images", "bench", "ablate", "train", "model", "up", "submit",
+    "jobs", "download", "submit-training", "trainings", "demo",
+)  # fmt: skip
+"""In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands; a
+hyphen of the name is an underscore there. ``CONTEXT`` holds the settings that the function wants of its own."""
 
 
 class _OnDemand(TyperGroup):
@@ -40,7 +38,7 @@ class _OnDemand(TyperGroup):
             group.name = cmd_name
             return group
         alone = typer.Typer(add_completion=False)
-        alone.command(cmd_name)(getattr(module, name))
+        alone.command(cmd_name, context_settings=getattr(module, "CONTEXT", None))(getattr(module, name))
         return typer.main.get_command(alone)
 
 

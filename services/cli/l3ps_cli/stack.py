@@ -13,7 +13,6 @@ DATA/logs/        one file a child
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 import json
 import os
 import secrets
@@ -29,6 +28,7 @@ from typing import Any
 import httpx
 
 from l3ps_cli.processes import Processes
+from l3ps_cli.trainer import missing
 from l3ps_platform.processes import StopPlan
 
 READY_SECONDS = 60.0
@@ -72,7 +72,7 @@ class StackOptions:
     @property
     def trains(self) -> bool:
         """Whether models can be trained: the trainer is looked for and not imported."""
-        return self.training and importlib.util.find_spec("l3ps_trainer") is not None
+        return self.training and not missing()
 
 
 class Stack:

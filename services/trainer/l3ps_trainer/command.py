@@ -131,6 +131,29 @@ def _kept_apart(text: str | None) -> Path | float | None:
     return share
 
 
+@app.command("import-pastel")
+def import_pastel(
+    semantic: Annotated[Path, typer.Argument(help="Lightning checkpoint of the semantic head.")],
+    boundary: Annotated[Path, typer.Argument(help="Lightning checkpoint of the boundary head.")],
+    out: Annotated[Path, typer.Option(help="Folder for the bundle.")],
+    name: Annotated[str, typer.Option(help="Of the model.")] = "pastel",
+    size: Annotated[str, typer.Option(help="HxW of the input, multiples of 14.")] = "896x1596",
+    classes: Annotated[Path | None, typer.Option(help="Classes file; void, nuScenes-16 and sky when left out.")] = None,
+    threads: Annotated[int, typer.Option(min=1, max=256, help="CPU threads.")] = 2,
+) -> None:
+    """Turn the authors' published checkpoints into a bundle that runs their encoder once for both heads."""
+    with _ending(events=False) as (report, _, _):
+        import torch  # noqa: PLC0415
+
+        from .pastel import import_checkpoints  # noqa: PLC0415
+
+        torch.set_num_threads(threads)
+        report("export", 0, 1)
+        agreed = import_checkpoints(semantic, boundary, out, name, parsed_size(size, "--size"), classes, threads)
+        report("export", 1, 1)
+    typer.echo(f"{out}: torch and ONNX Runtime differ by at most {agreed.probability:.1e} in any value", err=True)
+
+
 @app.command("speed-bundle")
 def speed_bundle(
     out: Annotated[Path, typer.Option(help="Folder for the bundle.")],

@@ -70,7 +70,7 @@ class Heads(nn.Module):
         return heads
 
 
-def _quarter(stride: int) -> int:
+def quarter(stride: int) -> int:
     """Enlargement that makes features about a quarter of the input's size, 4 for those of a ViT/14."""
     return max(1, round(stride / 4 + 0.01))
 
@@ -78,16 +78,16 @@ def _quarter(stride: int) -> int:
 def published(channels: int, classes: int, *, boundary: bool, stride: int) -> Heads:
     """Heads of the published widths and resolutions (METHOD 1, with DINOv2 ViT-B/14)."""
     return Heads(
-        Pointwise(channels, (300, 300, 200), classes, stride, _quarter(stride)),
-        Pointwise(channels, (600, 600, 400), 1, _quarter(stride)) if boundary else None,
+        Pointwise(channels, (300, 300, 200), classes, stride, quarter(stride)),
+        Pointwise(channels, (600, 600, 400), 1, quarter(stride)) if boundary else None,
     )
 
 
 def narrow(channels: int, classes: int, *, boundary: bool, stride: int) -> Heads:
     """Lighter heads that cost a ViT-S/14 under 5 % of its own work."""
     return Heads(
-        Pointwise(channels, (300, 200), classes, _quarter(stride)),
-        Pointwise(channels, (200, 100), 1, _quarter(stride)) if boundary else None,
+        Pointwise(channels, (300, 200), classes, quarter(stride)),
+        Pointwise(channels, (200, 100), 1, quarter(stride)) if boundary else None,
     )
 
 

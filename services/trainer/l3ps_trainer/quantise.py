@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from onnxruntime.quantization import QuantType, quantize_dynamic
-
 KEPT_WITHIN = 0.5
 """Points of validation mIoU that int8 may cost; a graph that costs more is not delivered."""
 
@@ -18,5 +16,7 @@ def quantise(graph: Path, target: Path) -> None:
         graph: float32.
         target: where to.
     """
+    from onnxruntime.quantization import QuantType, quantize_dynamic  # noqa: PLC0415  (slow to import, seldom used)
+
     logging.getLogger().setLevel(logging.ERROR)  # it recommends a preparation that changes nothing here
     quantize_dynamic(graph, target, op_types_to_quantize=["MatMul"], per_channel=True, weight_type=QuantType.QInt8)

@@ -63,8 +63,8 @@ def stoppable() -> Iterator[Stop]:
 class Events:
     """One JSON object a line."""
 
-    def __init__(self, stop: Stop, stream: TextIO = sys.stdout) -> None:
-        self._stop, self._stream, self._last = stop, stream, 0.0
+    def __init__(self, stop: Stop, stream: TextIO | None = None) -> None:
+        self._stop, self._stream, self._last = stop, stream or sys.stdout, 0.0
 
     def __call__(self, step: str, done: int, total: int, **figures: float) -> None:
         """A line, when the last one is old enough or the step is over."""

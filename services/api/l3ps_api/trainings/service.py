@@ -27,7 +27,8 @@ _LOG_TAIL = 4000
 _UNAVAILABLE = (
     "No worker of this service trains models: the trainer, which needs torch, is not installed with it. Whoever runs "
     "the service installs l3ps-trainer beside a worker, starts that worker on the queue `train` and sets "
-    "L3PS_TRAINING=1; with compose: L3PS_TRAINING=1 docker compose --profile train up."
+    "L3PS_TRAINING=1. With `l3ps up`: make setup-trainer, then start it again; with compose: L3PS_TRAINING=1 docker "
+    "compose --profile train up."
 )
 
 

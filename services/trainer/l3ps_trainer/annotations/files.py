@@ -15,7 +15,7 @@ from l3ps.drivelog.names import is_hidden
 PICTURES: Final = (".png", ".jpg", ".jpeg", ".npy")
 LABELS: Final = (".png", ".npy")
 """JPEG changes values, so no label map is one."""
-_DAMAGED: Final = (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError)
+DAMAGED: Final = (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError)
 
 
 class BadFile(ValueError):  # noqa: N818  (a clause for a Problem)
@@ -56,7 +56,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"), dtype=np.uint8)
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise BadFile(f"it cannot be decoded ({error})") from error
 
 
@@ -73,7 +73,7 @@ def read_labels(path: Path) -> NDArray[Any]:
         try:
             with Image.open(path) as image:
                 array = np.asarray(image)
-        except _DAMAGED as error:
+        except DAMAGED as error:
             raise BadFile(f"it cannot be decoded ({error})") from error
     if array.dtype == np.bool_:
         array = array.astype(np.uint8)

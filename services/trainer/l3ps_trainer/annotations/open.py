@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal, Protocol, get_args
@@ -13,11 +13,10 @@ from l3ps.drivelog.unpack import UnpackLimits, unpack
 from l3ps.errors import AnnotationError, Problem
 from l3ps.progress import Progress, silent
 
-from .plain import is_plain, read_plain
+from . import cityscapes, coco, nuimages, plain
 from .types import AnnotationSet
 
 Format = Literal["auto", "plain", "cityscapes", "coco", "nuimages"]
-LOOKED_FOR: Final = "images/ with semantic/"
 _NESTING: Final = 3
 """Folders an archive may wrap around the annotations."""
 
@@ -27,7 +26,13 @@ class _Reader(Protocol):
         """Read a folder of one format."""
 
 
-_FORMATS: Final = {"plain": (is_plain, read_plain)}
+_FORMATS: Final[dict[str, tuple[str, Callable[[Path], bool], _Reader]]] = {
+    "plain": (plain.LAYOUT, plain.is_plain, plain.read_plain),
+    "cityscapes": (cityscapes.LAYOUT, cityscapes.is_cityscapes, cityscapes.read_cityscapes),
+    "nuimages": (nuimages.LAYOUT, nuimages.is_nuimages, nuimages.read_nuimages),
+    "coco": (coco.LAYOUT, coco.is_coco, coco.read_coco),
+}
+"""By name: what is looked for, whether a folder has it, and the reader."""
 
 
 def open_annotations(
@@ -61,19 +66,18 @@ def open_annotations(
         what = "it is a file, not a folder" if path.exists() else "there is no such file or folder"
         raise AnnotationError(Problem("no-annotations", str(path), what, "Name the folder of the annotated images"))
     folder = path.resolve()
+    wanted = [_FORMATS[format]] if format != "auto" else list(_FORMATS.values())
     for _ in range(_NESTING + 1):
-        for name, (fits, read) in _FORMATS.items():
-            if format in ("auto", name) and fits(folder):
+        for _, fits, read in wanted:
+            if fits(folder):
                 return read(folder, classes, images, progress)
         inner = subfolders(folder)
         if len(inner) != 1:
             break
         folder = inner[0]
-    looked = LOOKED_FOR
-    what = f"no annotations found in it: looked for {looked}"
-    raise AnnotationError(
-        Problem("no-annotations", path.name or str(path), what, "Name a folder of one of these layouts")
-    )
+    what = f"no annotated images found in it: looked for {'; '.join(layout for layout, _, _ in wanted)}"
+    remedy = "Name a folder of this layout" if len(wanted) == 1 else "Name a folder of one of these layouts"
+    raise AnnotationError(Problem("no-annotations", path.name or str(path), what, remedy))
 
 
 @contextmanager

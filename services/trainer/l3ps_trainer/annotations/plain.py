@@ -20,6 +20,7 @@ from .faults import Faults
 from .files import LABELS, PICTURES, by_stem, read_labels
 from .types import AnnotationSet, spread
 
+LAYOUT: Final = "images/ with semantic/ (plain folder)"
 CLASSES: Final = "classes.json"
 _NAMES: Final = "Give the files of one image the same name in every folder, or take the others out"
 _IDS: Final = f"Name these ids in {CLASSES} or the file of --classes, as classes or under 'void'"

@@ -13,18 +13,19 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 from urllib.error import URLError
 
-import timm
 import torch
-from timm.models.vision_transformer import VisionTransformer, checkpoint_filter_fn
 from torch import Tensor
 from torch.nn import functional as f
 
 from l3ps.errors import ModelError, Problem
 
 from .base import Backbone, digest, input_spec
+
+if TYPE_CHECKING:
+    from timm.models.vision_transformer import VisionTransformer
 
 PATCH = 14
 OFFSET = 0.1
@@ -170,8 +171,11 @@ def resized_positions(grid: Tensor, size: tuple[int, int], *, registers: bool) -
 def _network(
     variant: Variant, weights: Mapping[str, Tensor] | None, size: tuple[int, int], architecture: dict[str, Any]
 ) -> VisionTransformer:
+    import timm  # noqa: PLC0415  (it takes seconds to import, which other backbones need not wait for)
+    from timm.models.vision_transformer import checkpoint_filter_fn  # noqa: PLC0415
+
     vit = cast(
-        VisionTransformer,
+        "VisionTransformer",
         timm.create_model(variant.timm, pretrained=False, num_classes=0, img_size=size, **architecture),
     )
     if weights is None:
