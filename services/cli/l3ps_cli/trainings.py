@@ -43,11 +43,11 @@ def _list(documents: list[dict[str, Any]]) -> None:
         return
     table = Table(box=None)
     table.add_column("training", min_width=29, no_wrap=True)  # an id is for copying, so it is never cut short
-    for name in ("model", "backbone", "annotations", "state", "done", "figures"):
+    for name in ("model", "backbone", "state", "done", "figures"):
         table.add_column(name)
     for one in documents:
         state = f"[{COLORS.get(one['state'], 'white')}]{one['state']}[/]"
-        row = (one["name"], one["settings"]["backbone"], one["annotations"]["name"], state)
+        row = (one["name"], one["settings"]["backbone"], state)
         table.add_row(one["id"], *row, f"{100 * one['progress']:.0f} %", _figures(one))
     out.print(table)
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from l3ps.errors import L3psError
 from l3ps_platform.processes import Child, spawn
@@ -67,17 +67,17 @@ class Trainer:
 
     Args:
         child: the process.
-        events, log: file descriptors it writes to, for reading.
+        events, log: the reading ends of the pipes it writes to.
         kept: takes its log.
     """
 
-    def __init__(self, child: Child, events: int, log: int, kept: Log) -> None:
+    def __init__(self, child: Child, events: IO[bytes], log: IO[bytes], kept: Log) -> None:
         self.child = child
         self._kept = kept
         self._line = bytearray()
         self._selector = selectors.DefaultSelector()
         for source, take in ((events, self._take_events), (log, self._take_log)):
-            os.set_blocking(source, False)
+            os.set_blocking(source.fileno(), False)
             self._selector.register(source, selectors.EVENT_READ, take)
 
     def events(self) -> Iterator[Event | None]:
@@ -121,7 +121,7 @@ class Trainer:
             if data:
                 found += key.data(data)
             else:
-                self._selector.unregister(key.fd)
+                self._selector.unregister(key.fileobj)
         return found
 
     def _take_log(self, data: bytes) -> list[Event]:
@@ -165,8 +165,8 @@ def running(options: Sequence[str], folder: Path, log: Log, *, gone: type[BaseEx
             "trainer", argv, _environment(os.environ), stdout=write_events, stderr=write_log, cwd=folder, stop_plan=()
         )
         trainer = Trainer(child, read_events, read_log, log)
-        os.close(write_events)  # ours: the reading ends are to end with the child's
-        os.close(write_log)
+        write_events.close()  # ours: the reading ends are to end with the child's
+        write_log.close()
         try:
             yield trainer
         except gone:
@@ -182,16 +182,10 @@ def children_cpu_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _pipe(stack: ExitStack) -> tuple[int, int]:
-    ends = os.pipe()
-    for end in ends:
-        stack.callback(_close, end)
-    return ends
-
-
-def _close(descriptor: int) -> None:
-    with suppress(OSError):
-        os.close(descriptor)
+def _pipe(stack: ExitStack) -> tuple[IO[bytes], IO[bytes]]:
+    """A pipe's ends as files, which may be closed twice without closing what has got their number meanwhile."""
+    read, write = os.pipe()
+    return stack.enter_context(open(read, "rb", buffering=0)), stack.enter_context(open(write, "wb", buffering=0))
 
 
 def _environment(ours: Mapping[str, str]) -> dict[str, str]:

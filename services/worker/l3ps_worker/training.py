@@ -28,6 +28,7 @@ CHECKPOINT = Path(OUT, ".training", "checkpoint.pt")
 _BAD_INPUT = 2
 _USELESS_CHECKPOINT = ("bad-checkpoint", "other-settings")
 """What the trainer says of a checkpoint that it does not go on from."""
+_CLASSES = "classes.json"
 _LOG_SECONDS = 5.0
 _OPTIONS = ("recipe", "format", "images", "validation", "size", "balanced", "epochs", "seed")
 """Settings that are options of the trainer under the same name."""
@@ -127,8 +128,8 @@ class TrainingRun:
         options += ["--int8"] if asked.get("int8") else []
         options += ["--validation=validation"] if "validation" in self._inputs else []
         if asked.get("classes") is not None:
-            (self._folder / "classes.json").write_text(json.dumps(asked["classes"]))
-            options.append("--classes=classes.json")
+            (self._folder / _CLASSES).write_text(json.dumps(asked["classes"]))
+            options.append(f"--classes={_CLASSES}")
         return options
 
     def _take(self, event: Event | None, trainer: Trainer) -> None:
@@ -217,7 +218,8 @@ class TrainingRun:
                 where, what = where.replace(path, known), what.replace(path, known)
             if where == name or where.startswith(f"{name}/"):
                 where = known + where.removeprefix(name)
-        where = where.removeprefix("--")  # options have the names of the request's fields
+        # Options have the names of the request's fields.
+        where = "classes" if where == _CLASSES else where.removeprefix("--")
         return Problem(problem.code, where, what, problem.remedy, problem.severity, problem.scene, problem.scan)
 
 

@@ -33,7 +33,8 @@ def main(command, annotations, *words):
     if mood == "refuses":
         where = str(Path(annotations).resolve() / "images" / images[0])
         problem = {"code": "no-label", "where": where, "what": "it has no label", "remedy": "Add one."}
-        tell(event="error", problems=[problem, problem | {"where": f"{annotations}/semantic", "code": "empty"}])
+        other = problem | {"where": f"{annotations}/semantic", "code": "empty"}
+        tell(event="error", problems=[problem, other, problem | {"where": "--size", "code": "bad-size"}])
         raise SystemExit(2)
     if mood == "crashes":
         raise SystemExit("Traceback: something broke")

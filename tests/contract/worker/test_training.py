@@ -137,7 +137,7 @@ def test_the_trainer_s_problems_are_the_training_s_under_the_user_s_names(direct
     row = desk.row(id)
     assert row.state is JobState.FAILED
     found = [(problem["where"], problem["code"]) for problem in row.error["problems"]]
-    assert found == [("thirty.zip/images/a.png", "no-label"), ("thirty.zip/semantic", "empty")]
+    assert found == [("thirty.zip/images/a.png", "no-label"), ("thirty.zip/semantic", "empty"), ("size", "bad-size")]
     assert not [info.key for info in direct.store.list("stages/")]
 
 

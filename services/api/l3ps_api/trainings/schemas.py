@@ -20,20 +20,23 @@ AnnotationFormat = Literal["auto", "plain", "cityscapes", "coco", "nuimages"]
 class AnnotatedClass(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    id: int = Field(ge=0, le=255, description="Value in the images of `semantic/`.")
+    id: int | str | None = Field(default=None, description="Number or name in the annotations; default: the category.")
+    category: str | None = Field(default=None, description="The same, of formats that name them; default: the name.")
     name: str = Field(min_length=1, max_length=100)
-    nuscenes: str | Annotated[int, Field(ge=0, le=16)] = Field(
-        description="Class of the nuScenes-16 label space that it counts as, by name or number; `void` for none."
+    nuscenes: str | int | None = Field(
+        default=None,
+        description="Class of Panoptic nuScenes that it counts as, by name or number, `void` for none; may be left out "
+        "where the name says it.",
     )
 
 
 class Classes(BaseModel):
-    """What the numbers in the annotations mean, where the archive does not say it itself."""
+    """What the numbers in the annotations mean, where the archive does not say it itself: a classes file, inline."""
 
     model_config = ConfigDict(extra="forbid")
 
-    classes: Annotated[list[AnnotatedClass], Field(min_length=1, max_length=256)]
-    void: list[int] = Field(default_factory=list, description="Numbers that mean nothing: not learnt, not measured.")
+    classes: Annotated[list[AnnotatedClass], Field(min_length=1, max_length=1000)]
+    void: list[int | str] = Field(default_factory=list, max_length=1000, description="What is not annotated.")
 
 
 class TrainingSettings(BaseModel):
