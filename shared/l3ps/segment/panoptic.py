@@ -133,12 +133,12 @@ def fill(semantic: NDArray[np.uint8], instance: NDArray[np.int32], holes: NDArra
         semantic[:], instance[:] = VOID, 0
     if number in {0, holes.size}:
         return
-    # The nearest labelled pixel touches the hole, or lies a knight's move of the distance's 5×5 mask away.
+    # The nearest labelled pixel touches the hole.
     x, y, width, height = cv2.boundingRect(holes)
-    around, _ = _widened(np.s_[y : y + height, x : x + width], 2, holes.shape)
+    around, _ = _widened(np.s_[y : y + height, x : x + width], 1, holes.shape)
     semantic, instance, holes = semantic[around], instance[around], holes[around]
     for box, member in _windows(*_blobs(holes)):
-        window, inner = _widened(box, 2, holes.shape)
+        window, inner = _widened(box, 1, holes.shape)
         rows, columns = np.nonzero(member)
         rows, columns = rows + inner[0], columns + inner[1]
         source, _ = _nearest(holes[window] ^ np.uint8(1), rows, columns)
