@@ -18,25 +18,27 @@ class Network:
     Args:
         bundle: the model.
         preset: name of the segmentation preset whose graph to run.
-        threads: threads inside one operator, the caller's included; at least 1.
+        threads: threads inside one operator, the caller's included; None leaves the runtime all its defaults, to
+            measure against.
 
     Raises:
         ModelError: when the bundle has no graph for the preset, the graph cannot be loaded, or its inputs and outputs
             are not those of ``model.json``.
     """
 
-    def __init__(self, bundle: ModelBundle, preset: str, threads: int) -> None:
+    def __init__(self, bundle: ModelBundle, preset: str, threads: int | None) -> None:
         graph, self.spec = bundle.graph_for(preset)
         self._bundle = bundle
         output = bundle.info.output
         self._names = [output.semantic] + ([output.boundary] if output.boundary else [])
         options = ort.SessionOptions()
-        # 0 would mean every core of the machine, pinned and spinning: that starves neighbours in a container with a
-        # CPU limit.
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
+        if threads is not None:
+            # By default it takes every core of the machine, pinned and spinning, which starves neighbours in a
+            # container with a CPU limit.
+            options.intra_op_num_threads = threads
+            options.inter_op_num_threads = 1
+            options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             if bundle.data:  # the weights' bytes: the runtime opens no file
                 names = list(bundle.data)

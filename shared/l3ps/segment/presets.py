@@ -26,6 +26,10 @@ class SegmentPreset:
     boundary: tuple[int, ...] = (1,)
     fusion: Fusion = "components"
 
+    def passes(self, boundary: bool) -> int:
+        """Passes of the network an image, with or without a boundary head."""
+        return sum(n * n for n in {*self.semantic, *(self.boundary if boundary else ())})
+
     def as_dict(self) -> dict[str, Any]:
         """Plain data, for content keys and reports."""
         return asdict(self)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,13 @@ from l3ps.segment.tiles import averaged
 LANES = 2
 """Images in work at a time. Two passes side by side take less time than one after the other on twice the threads,
 and while one lane decodes, resizes or fuses, the other computes."""
+
+
+STEPS = ("decode", "resize", "network", "label", "fuse")
+"""What an image goes through."""
+
+Clock = Callable[[str], AbstractContextManager[None]]
+"""Entered around each of :data:`STEPS`, in the thread that takes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +60,7 @@ class Segmenter:
         threads: threads in work at a time, at least 1: the lanes and those that the runtime adds inside an operator.
         min_area: smallest object as a share of the image (see :func:`l3ps.segment.panoptic.fuse`).
         preset: how to look at an image.
+        clock: told of every step, to measure it.
 
     Raises:
         ModelError: when the graph cannot be loaded or its inputs and outputs are not those of ``model.json``, or the
@@ -59,13 +68,19 @@ class Segmenter:
     """
 
     def __init__(
-        self, bundle: ModelBundle, threads: int = 2, min_area: float = 0.0, preset: SegmentPreset = FAST
+        self,
+        bundle: ModelBundle,
+        threads: int = 2,
+        min_area: float = 0.0,
+        preset: SegmentPreset = FAST,
+        clock: Clock = lambda step: nullcontext(),
     ) -> None:
         if threads < 1:
             raise ValueError(f"threads must be at least 1, not {threads}")
         self.bundle = bundle
         self.min_area = min_area
         self.preset = preset
+        self._clock = clock
         self.lanes = min(threads, LANES)
         # All lanes share the threads that the session adds to each caller's own.
         self.network = Network(bundle, preset.name, threads - self.lanes + 1)
@@ -100,7 +115,9 @@ class Segmenter:
             options.terminate = True
 
         def one(path: Path) -> PanopticImage:
-            return self.label(self.look(open_image(path), options))
+            with self._clock("decode"):
+                image = open_image(path)
+            return self.label(self.look(image, options))
 
         return in_order(one, paths, lanes=self.lanes, ahead=2 * self.lanes, stop=stop)
 
@@ -114,7 +131,10 @@ class Segmenter:
         spec = self.network.spec
 
         def one(box: Box | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-            return self.network.run(network_input(image, spec, box), options)
+            with self._clock("resize"):
+                planes = network_input(image, spec, box)
+            with self._clock("network"):
+                return self.network.run(planes, options)
 
         if self.preset.semantic == self.preset.boundary == (1,):
             return Seen(*one(), image.size)
@@ -124,12 +144,15 @@ class Segmenter:
     def label(self, seen: Seen) -> PanopticImage:
         """Classes, objects and the scores that are kept."""
         info = self.bundle.info
-        semantic = info.lut[strongest(seen.logits)]
-        interior = None
-        if seen.inside is not None:
-            interior = _at_size(seen.inside, semantic.shape) >= info.output.boundary_threshold
-        labels = fuse(semantic, seen.size, interior=interior, min_area=self.min_area)
-        return replace(labels, scores=ClassScores.compact(seen.logits, info.lut, semantic.shape))
+        with self._clock("label"):
+            semantic = info.lut[strongest(seen.logits)]
+            scores = ClassScores.compact(seen.logits, info.lut, semantic.shape)
+        with self._clock("fuse"):
+            interior = None
+            if seen.inside is not None:
+                interior = _at_size(seen.inside, semantic.shape) >= info.output.boundary_threshold
+            labels = fuse(semantic, seen.size, interior=interior, min_area=self.min_area)
+        return replace(labels, scores=scores)
 
 
 def _at_size(plane: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
