@@ -14,43 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from l3ps.segment.scores import ClassScores
 from l3ps.taxonomy import NUSCENES16, VOID
 
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClassScores:
-    """The network's raw scores, made probabilities only where a point asks.
-
-    A scan's points meet one pixel in fifty: a softmax over the whole picture would cost as much as a tenth of the
-    network and 17 planes of memory.
-
-    Attributes:
-        logits: (K, h, w) float32, one plane a class of the network.
-        classes: (K,) uint8 ``NUSCENES16`` class of each plane; several planes may share one.
-    """
-
-    logits: NDArray[np.float32]
-    classes: NDArray[np.uint8]
-
-    def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Class probabilities of some pixels.
-
-        Args:
-            row, column: (n,) pixel indices.
-
-        Returns:
-            (n, 17) float32 that add up to 1: the softmax over the network's classes, added up over those that share a
-            class.
-        """
-        scores = self.logits[:, row, column]
-        scores = np.exp(scores - scores.max(axis=0))
-        merged = np.zeros((len(NUSCENES16.classes), len(row)), dtype=np.float32)
-        for plane, index in zip(scores, self.classes, strict=True):
-            merged[index] += plane
-        return np.ascontiguousarray((merged / merged.sum(axis=0)).T)
 
 
 @dataclass(frozen=True, slots=True)
