@@ -91,6 +91,7 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
         "classes": list(bundle.info.classes),
         "input": [spec.height, spec.width],
         "has_boundary": bundle.info.output.boundary is not None,
+        "passes": sorted(bundle.info.passes),
     }
     return Done(lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=[], sha256=sha256, info=info))
 
