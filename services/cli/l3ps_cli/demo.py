@@ -52,7 +52,7 @@ def demo(
     except StopRequested:
         fail("The demo was stopped; the service it had started is gone.", JOB_FAILED)
     except ChildDiedError as error:
-        fail(f"{error}. Its last lines:\n{error.child.last_lines()}", JOB_FAILED)
+        fail(f"{error}. Its last lines:\n{error.last_lines}", JOB_FAILED)
     except (StackError, TimeoutError, DamagedDownloadError) as error:
         fail(str(error), JOB_FAILED)
     out.print(stage_table(job))

@@ -12,7 +12,7 @@ from l3ps_cli.client import Client
 from l3ps_cli.console import out, service_errors
 from l3ps_cli.report import quality_table, stage_table
 
-_COLORS = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
+COLORS = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
 
 
 def jobs(
@@ -55,7 +55,7 @@ def _list(documents: list[dict[str, Any]]) -> None:
             job["drive"]["name"],
             job["model"]["name"],
             job["preset"],
-            f"[{_COLORS.get(job['state'], 'white')}]{job['state']}[/]",
+            f"[{COLORS.get(job['state'], 'white')}]{job['state']}[/]",
             f"{100 * job['progress']:.0f} %",
             f"{refined['pq']:.1f}" if refined else "",
         )

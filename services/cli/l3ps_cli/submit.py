@@ -151,42 +151,52 @@ def ensure_model(client: Client, model: str) -> str:
     return name
 
 
-def check_log(log: Path) -> None:
-    """Raise DriveLogError when a log is neither a directory nor an archive the service takes."""
+def check_log(log: Path, what_it_is: str = "a drive log") -> None:
+    """Raise DriveLogError when a log, or whatever it is, is neither a directory nor an archive the service takes."""
     if log.is_dir():
         return
     if not log.is_file():
-        what, remedy = "there is no such file or directory", "Name a drive log."
+        what, remedy = "there is no such file or directory", f"Name {what_it_is}."
         raise DriveLogError(Problem("no-log", str(log), what, remedy))
     if not is_archive_name(log):
         what, remedy = "it is no archive by its name", f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."
         raise DriveLogError(Problem("no-archive", str(log), what, remedy))
 
 
-def upload_log(client: Client, log: Path) -> dict[str, Any]:
-    """The drive document of a log that ``check_log`` passed, uploaded unless the service has one of the same bytes."""
+def upload_log(client: Client, log: Path, kind: str = "drive") -> dict[str, Any]:
+    """Upload a log or annotations that ``check_log`` passed, unless the service has some of the same bytes.
+
+    Args:
+        client: the service.
+        log: directory or archive.
+        kind: ``drive`` or ``annotations``.
+
+    Returns:
+        The drive's or the annotations' document.
+    """
     if log.is_dir():
         with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
             archive = Path(scratch) / f"{log.resolve().name}.tar"
             with _bytes_bar("packing") as (_, report):
                 pack_log(log, archive, report)
-            return _upload_archive(client, archive, log.resolve().name)
+            return _upload_archive(client, archive, log.resolve().name, kind)
     name = log.name
     for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
         name = name.removesuffix(suffix)
-    return _upload_archive(client, log, name)
+    return _upload_archive(client, log, name, kind)
 
 
-def _upload_archive(client: Client, archive: Path, name: str) -> dict[str, Any]:
+def _upload_archive(client: Client, archive: Path, name: str, kind: str) -> dict[str, Any]:
     size = archive.stat().st_size
     with _bytes_bar("checksum") as (_, report):
         sha256 = sha256_of(archive, report)
-    for drive in client.get("/drives", sha256=sha256)["items"]:
-        if drive["state"] != "rejected":
-            err.print(f"the service has this log already: {drive['id']}", highlight=False)
-            return dict(drive)
+    folder, called = {"drive": ("/drives", "this log"), "annotations": ("/annotations", "these annotations")}[kind]
+    for known in client.get(folder, sha256=sha256)["items"]:
+        if known.get("state") != "rejected":
+            err.print(f"the service has {called} already: {known['id']}", highlight=False)
+            return dict(known)
     with _bytes_bar("uploading", size) as (advance, _):
-        return client.upload(archive, "drive", sha256, name, advance)
+        return client.upload(archive, kind, sha256, name, advance)
 
 
 @contextmanager

@@ -60,7 +60,7 @@ class Stage(BaseModel):
     """One unit of work that a worker takes."""
 
     id: str
-    name: str = Field(description="`ingest`, `segment`, `refine` or `publish`.")
+    name: str = Field(description="`ingest`, `segment`, `refine`, `publish` or `train`.")
     state: StageState
     attempt: int
     step: str | None = Field(default=None, description="What the method is doing now.")
