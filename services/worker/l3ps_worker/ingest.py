@@ -97,6 +97,7 @@ def check_model(archive: Path, threads: int) -> Json:
         "classes": list(bundle.info.classes),
         "input": [spec.height, spec.width],
         "has_boundary": bundle.info.output.boundary is not None,
+        "passes": sorted(bundle.info.passes),
     }
 
 

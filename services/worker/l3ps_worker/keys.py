@@ -18,6 +18,7 @@ import l3ps
 from l3ps.errors import ProcessingError
 from l3ps.presets import Preset
 from l3ps.refine.cluster import build
+from l3ps.segment.presets import SegmentPreset
 from l3ps_worker.trainer import TRAINER
 
 _ROOT = Path(l3ps.__path__[0])
@@ -26,7 +27,9 @@ _BUNDLE = ("segment", "taxonomy.py")
 _NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
 
 
-def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset, *, skip: bool) -> str:
+def segment_key(
+    drive_sha256: str, model_sha256: str, scene: str, preset: Preset, look: SegmentPreset, *, skip: bool
+) -> str:
     """Key of a scene's primal labels."""
     return _key(
         "segment",
@@ -34,6 +37,7 @@ def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset
         model=model_sha256,
         scene=scene,
         min_area=preset.min_area,
+        look=look.as_dict(),
         skip=skip,
         code=code_version(_SEGMENTATION),
     )
