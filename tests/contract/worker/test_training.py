@@ -279,11 +279,11 @@ def test_a_training_survives_its_trainer_and_its_worker_and_can_be_cancelled(ser
         id = desk.start("stays")
 
         def at_work(attempt: int) -> int | None:
-            """The process that watches over the trainer, once a checkpoint of this attempt is in the store."""
+            """The process that watches over the trainer, once this attempt's checkpoint and log are in the store."""
             stage, stored = desk.stage(id), [bench.store.get_bytes(i.key) for i in bench.store.list("stages/")]
             if stage.attempt != attempt or stored != [str(attempt).encode()] or desk.row(id).log_key is None:
                 return None
-            return int(stage.lease_owner.rpartition(":")[2])
+            return int(stage.lease_owner.rpartition(":")[2]) if f"from step {attempt - 1}" in desk.log(id) else None
 
         watcher = bench.until(lambda: at_work(1))
         (trainer,) = children_of(watcher)
