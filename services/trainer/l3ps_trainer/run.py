@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from l3ps.errors import InputError, Problem
 from l3ps.segment.bundle import InputSpec
@@ -278,7 +279,7 @@ def _quantised(
 
 def _inputs(annotations: AnnotationSet, spec: InputSpec) -> list[np.ndarray[Any, np.dtype[np.float32]]]:
     few = annotations.subset(spread(len(annotations.images), COMPARED_IMAGES))
-    return [network_input(image.load().rgb, spec) for image in few.images]
+    return [network_input(Image.fromarray(image.load().rgb), spec) for image in few.images]
 
 
 def _name(request: Request) -> str:
