@@ -12,7 +12,20 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-COMMANDS = ("label", "evaluate", "draw", "simulate", "bench", "ablate", "up", "submit", "jobs", "download", "demo")
+COMMANDS = (
+    "label",
+    "evaluate",
+    "draw",
+    "simulate",
+    "bench",
+    "ablate",
+    "model",
+    "up",
+    "submit",
+    "jobs",
+    "download",
+    "demo",
+)
 """In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands."""
 
 
