@@ -188,3 +188,10 @@ def test_an_image_of_one_class_without_a_boundary_has_no_objects(value):
     panoptic = fuse_cuts(semantic, (40, 30), np.ones((30, 40), np.float32))
     assert not panoptic.instance.any()
     assert (panoptic.semantic == (0 if value == CAR else value)).all()
+
+
+def test_what_is_no_number_is_no_boundary():
+    semantic, inside, _ = street()
+    inside[:30] = np.nan
+    panoptic = fuse_cuts(semantic, (400, 225), inside, min_area=100 / semantic.size)
+    assert len(np.unique(panoptic.instance)) == 4
