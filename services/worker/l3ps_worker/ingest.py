@@ -11,9 +11,8 @@ import structlog
 
 from l3ps.drivelog import Drive, open_drive, unpack, validate, without_bad_scans
 from l3ps.errors import InputError, Problem
-from l3ps.progress import Progress
-from l3ps.segment.bundle import ModelBundle
-from l3ps.segment.session import Segmenter
+from l3ps.progress import Progress, silent
+from l3ps.segment.check import check_bundle
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, Json, ModelRow, bundles, drives
 from l3ps_platform.errors import StoreError
@@ -75,7 +74,7 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
         sha256 = download(context, row.object_key, archive, row.size, progress)
         try:
             check_sha256(row.sha256, sha256, row.filename)
-            info = check_model(archive, context.settings.threads)
+            info = check_model(archive, context.settings.threads, progress)
         except InputError as error:
             problems = [_without_path(problem, folder, row.filename) for problem in error.problems]
             log.info("model rejected", problems=[str(problem) for problem in problems])
@@ -86,18 +85,16 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
     return Done(lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=[], sha256=sha256, info=info))
 
 
-def check_model(archive: Path, threads: int) -> Json:
+def check_model(archive: Path, threads: int, progress: Progress = silent) -> Json:
     """What the catalog says about a zipped bundle. ModelError for one that cannot be used."""
-    bundle = ModelBundle.load(archive)
-    Segmenter(bundle, threads)  # onnxruntime reads the graph here
-    spec = bundle.info.input
+    report = check_bundle(archive, threads=threads, progress=progress)
     return {
-        "name": bundle.info.name,
-        "label_space": bundle.info.label_space,
-        "classes": list(bundle.info.classes),
-        "input": [spec.height, spec.width],
-        "has_boundary": bundle.info.output.boundary is not None,
-        "passes": sorted(bundle.info.passes),
+        "name": report.name,
+        "label_space": report.label_space,
+        "classes": list(report.classes),
+        "input": report.graphs[0].input[2:],
+        "has_boundary": report.boundary,
+        "passes": sorted(graph.preset for graph in report.graphs[1:]),
     }
 
 

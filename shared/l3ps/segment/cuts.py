@@ -98,7 +98,8 @@ def _boundary(
     shrinks = target[0] < inside.shape[1]
     # Averaged where it shrinks: a line that is thinner than the map's pixels must not fall between them.
     coarse = cv2.resize(inside, target, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    strength = np.clip(1 - np.asarray(coarse, dtype=np.float32), 0, 1)
+    # Where the network gave no number there is no boundary.
+    strength = np.clip(np.nan_to_num(1 - np.asarray(coarse, dtype=np.float32)), 0, 1)
     passes = (strength > 1 - threshold).view(np.uint8)
     return strength, np.asarray(cv2.dilate(passes, np.ones((3, 3), np.uint8))).view(np.bool_)
 
