@@ -146,7 +146,7 @@ class Segmenter:
         info = self.bundle.info
         with self._clock("label"):
             semantic = info.lut[strongest(seen.logits)]
-            scores = ClassScores.compact(seen.logits, info.lut, semantic.shape)
+            scores = ClassScores.compact(seen.logits, info.lut)
         with self._clock("fuse"):
             interior = None
             if seen.inside is not None:
