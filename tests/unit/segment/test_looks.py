@@ -1,6 +1,7 @@
 """The ways to look at an image, on networks whose answers are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,17 @@ def test_tilings_agree_with_one_pass_where_there_is_nothing_more_to_see(write_bu
     rows, columns = np.array([16, 1]), np.array([16, 60])
     np.testing.assert_allclose(tiled.scores.at(rows, columns).sum(axis=1), 1, atol=1e-5)
     assert tiled.scores.at(rows, columns).argmax(axis=1).tolist() == [CAR, ROAD]
+
+
+@pytest.mark.parametrize(("fusion", "objects"), [("components", 1), ("cuts", 0)])
+def test_the_preset_decides_how_things_become_objects(write_bundle, fusion, objects):
+    """A car that touches no boundary is an object to components, and none as published."""
+    output = {"semantic": "logits", "boundary": "inside", "boundary_threshold": 0.5}
+    folder = write_bundle(graph=write_bundle.graph(boundary=True), info=write_bundle.description(output=output))
+    image = np.full((64, 128, 3), (0, 180, 160), np.uint8)
+    image[10:50, 20:90] = (255, 0, 160)
+    labels = Segmenter(ModelBundle.load(folder), preset=replace(FAST, fusion=fusion)).segment(image)
+    assert labels.instance.max() == objects
 
 
 def test_passes_are_counted_once_for_both_heads():
