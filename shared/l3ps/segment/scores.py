@@ -23,25 +23,23 @@ class ClassScores:
     network and 17 planes of memory.
 
     Attributes:
-        logits: (K, h, w) float32, one plane a class of the network.
+        logits: (K, h, w) float32, one plane a class of the network, at every ``step``-th pixel of the label map.
         classes: (K,) uint8 ``NUSCENES16`` class of each plane; several planes may share one.
-        shape: rows and columns of the label map that the scores belong to, where it is finer or coarser than they
-            are; None where it is not.
+        step: 1 where there are scores for every pixel; between others they are interpolated.
     """
 
     logits: NDArray[np.float32]
     classes: NDArray[np.uint8]
-    shape: tuple[int, int] | None = None
+    step: int = 1
 
     @classmethod
-    def compact(cls, logits: NDArray[np.float32], classes: NDArray[np.uint8], shape: tuple[int, int]) -> ClassScores:
-        """Scores at no more than :data:`KEPT_PIXELS`, each the mean of the block of pixels it stands for."""
-        height, width = logits.shape[1:]
-        factor = int(np.ceil(np.sqrt(height * width / KEPT_PIXELS)))
-        if factor > 1:
-            size = (-(-width // factor), -(-height // factor))
-            logits = np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in logits])
-        return cls(logits, classes, shape)
+    def compact(cls, logits: NDArray[np.float32], classes: NDArray[np.uint8]) -> ClassScores:
+        """Scores at no more than about :data:`KEPT_PIXELS`.
+
+        Large maps end in a bilinear enlargement as a rule, which the interpolation makes again.
+        """
+        step = int(np.ceil(np.sqrt(logits[0].size / KEPT_PIXELS)))
+        return cls(logits if step == 1 else logits[:, ::step, ::step].copy(), classes, step)
 
     def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.float32]:
         """Class probabilities of some pixels.
@@ -53,17 +51,21 @@ class ClassScores:
             (n, 17) float32 that add up to 1: the softmax over the network's classes, added up over those that share a
             class.
         """
-        if self.shape is not None:
-            row, column = (
-                (2 * index + 1) * kept // (2 * of)  # the pixel in which the centre of the label map's pixel lies
-                for index, kept, of in zip((row, column), self.logits.shape[1:], self.shape, strict=True)
-            )
-        scores = self.logits[:, row, column]
+        scores = self.logits[:, row, column] if self.step == 1 else self._between(row, column)
         scores = np.exp(scores - scores.max(axis=0))
         merged = np.zeros((len(NUSCENES16.classes), len(row)), dtype=np.float32)
         for plane, index in zip(scores, self.classes, strict=True):
             merged[index] += plane
         return np.ascontiguousarray((merged / merged.sum(axis=0)).T)
+
+    def _between(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.float32]:
+        """(K, n) scores of pixels of the label map, bilinear; beyond the last that was kept, that one."""
+        (top, down), (left, right) = (np.divmod(index, self.step) for index in (row, column))
+        bottom, far = np.minimum(top + 1, self.logits.shape[1] - 1), np.minimum(left + 1, self.logits.shape[2] - 1)
+        down, right = (np.asarray(rest / self.step, dtype=np.float32) for rest in (down, right))
+        upper = self.logits[:, top, left] * (1 - right) + self.logits[:, top, far] * right
+        lower = self.logits[:, bottom, left] * (1 - right) + self.logits[:, bottom, far] * right
+        return np.asarray(upper * (1 - down) + lower * down, dtype=np.float32)
 
 
 def strongest(logits: NDArray[np.float32]) -> NDArray[np.int32]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from l3ps.segment.bundle import ModelBundle
+from l3ps.segment.cuts import fuse_cuts
 from l3ps.segment.images import Box, network_input, open_image
 from l3ps.segment.network import Network
 from l3ps.segment.panoptic import PanopticImage, fuse
@@ -146,13 +147,20 @@ class Segmenter:
         info = self.bundle.info
         with self._clock("label"):
             semantic = info.lut[strongest(seen.logits)]
-            scores = ClassScores.compact(seen.logits, info.lut, semantic.shape)
+            scores = ClassScores.compact(seen.logits, info.lut)
         with self._clock("fuse"):
-            interior = None
-            if seen.inside is not None:
-                interior = _at_size(seen.inside, semantic.shape) >= info.output.boundary_threshold
-            labels = fuse(semantic, seen.size, interior=interior, min_area=self.min_area)
+            labels = self._fused(semantic, seen)
         return replace(labels, scores=scores)
+
+    def _fused(self, semantic: NDArray[np.uint8], seen: Seen) -> PanopticImage:
+        """Objects as the preset wants them; without a boundary map there is nothing to cut along."""
+        threshold = self.bundle.info.output.boundary_threshold
+        if seen.inside is None:
+            return fuse(semantic, seen.size, min_area=self.min_area)
+        if self.preset.fusion == "cuts":
+            return fuse_cuts(semantic, seen.size, seen.inside, threshold=threshold, min_area=self.min_area)
+        interior = _at_size(seen.inside, semantic.shape) >= threshold
+        return fuse(semantic, seen.size, interior=interior, min_area=self.min_area)
 
 
 def _at_size(plane: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -1,6 +1,7 @@
 """The ways to look at an image, on networks whose answers are known."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,17 @@ def test_tilings_agree_with_one_pass_where_there_is_nothing_more_to_see(write_bu
     assert tiled.scores.at(rows, columns).argmax(axis=1).tolist() == [CAR, ROAD]
 
 
+@pytest.mark.parametrize(("fusion", "objects"), [("components", 1), ("cuts", 0)])
+def test_the_preset_decides_how_things_become_objects(write_bundle, fusion, objects):
+    """A car that touches no boundary is an object to components, and none as published."""
+    output = {"semantic": "logits", "boundary": "inside", "boundary_threshold": 0.5}
+    folder = write_bundle(graph=write_bundle.graph(boundary=True), info=write_bundle.description(output=output))
+    image = np.full((64, 128, 3), (0, 180, 160), np.uint8)
+    image[10:50, 20:90] = (255, 0, 160)
+    labels = Segmenter(ModelBundle.load(folder), preset=replace(FAST, fusion=fusion)).segment(image)
+    assert labels.instance.max() == objects
+
+
 def test_passes_are_counted_once_for_both_heads():
     assert FAST.passes(boundary=True) == BALANCED.passes(boundary=False) == 1
     assert PAPER.passes(boundary=False) == 14
@@ -97,20 +109,28 @@ def test_the_strongest_class_is_that_of_argmax_and_the_first_of_equal_ones():
         np.testing.assert_array_equal(strongest(logits), logits.argmax(axis=0))
 
 
-def test_large_scores_are_kept_small_and_found_by_the_label_map_s_pixels():
-    shape = (600, 1000)
-    logits = np.zeros((2, *shape), np.float32)
-    logits[1, 300:, 500:] = 50
-    logits[0, :300, :500] = 50
-    kept = ClassScores.compact(logits, np.array([CAR, ROAD], np.uint8), shape)
-    assert kept.logits[0].size <= KEPT_PIXELS
-    row, column = np.array([0, 290, 310, 599, 0]), np.array([0, 490, 510, 999, 999])
-    assert kept.at(row, column)[:, CAR].round(3).tolist() == [1, 1, 0, 0, 0.5]
+def test_large_scores_are_kept_small_and_found_again_between_those_kept():
+    """A plane that rises evenly in both directions is the same after the interpolation."""
+    shape = (601, 1001)
+    rise = (np.arange(601)[:, None] / 100 - np.arange(1001) / 150).astype(np.float32)
+    logits = np.stack([rise, np.zeros(shape, np.float32)])
+    kept = ClassScores.compact(logits, np.array([CAR, ROAD], np.uint8))
+    assert kept.logits[0].size <= KEPT_PIXELS * 1.01
+    row, column = np.array([0, 291, 310, 599, 600]), np.array([0, 490, 511, 999, 1000])
+    expected = 1 / (1 + np.exp(-rise[row, column]))
+    np.testing.assert_allclose(kept.at(row, column)[:, CAR], expected, rtol=1e-4)
+
+
+def test_pixels_beyond_the_last_score_kept_take_that_one():
+    logits = np.zeros((2, 600, 1000), np.float32)
+    logits[0, -2:, -2:] = 50
+    kept = ClassScores.compact(logits, np.array([CAR, ROAD], np.uint8))
+    assert kept.at(np.array([599]), np.array([999]))[0, CAR] == pytest.approx(1)
 
 
 def test_small_scores_are_kept_as_they_are():
     logits = np.random.default_rng(0).normal(size=(3, 40, 60)).astype(np.float32)
-    kept = ClassScores.compact(logits, np.array([CAR, ROAD, ROAD], np.uint8), (40, 60))
+    kept = ClassScores.compact(logits, np.array([CAR, ROAD, ROAD], np.uint8))
     assert kept.logits is logits
     row, column = np.divmod(np.arange(2400), 60)
     expected = np.exp(logits) / np.exp(logits).sum(axis=0)
