@@ -234,6 +234,14 @@ class TestSubmit:
         with pytest.raises(ModelError), catalog.transaction() as tx:
             workflow.submit_job(tx, drive_id=drive, model=model)
 
+    def test_a_way_to_look_at_images_that_the_model_has_no_graph_for_is_refused(self, catalog: Catalog, play) -> None:
+        drive, plain, rich = play.drive(), play.model(), play.model(info={"passes": ["balanced"]})
+        with pytest.raises(ModelError, match="no graph for the preset 'balanced'"), catalog.transaction() as tx:
+            workflow.submit_job(tx, drive_id=drive, model=plain, segment="balanced")
+        with catalog.transaction() as tx:
+            job = workflow.submit_job(tx, drive_id=drive, model=rich, segment="balanced")
+            assert job.settings["segment"] == "balanced"
+
     def test_bad_scans_are_skipped_only_when_asked(self, catalog: Catalog, play, sent) -> None:
         drive, model = play.drive(problems=[SPOILT]), play.model()
         with pytest.raises(DriveLogError, match="3 bytes"), catalog.transaction() as tx:

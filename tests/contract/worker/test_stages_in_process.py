@@ -84,6 +84,17 @@ def test_the_same_again_is_not_computed_again(direct, drive_zip: Path, fast_mode
     assert direct.job(other).state is JobState.SUCCEEDED
 
 
+def test_another_look_at_the_images_is_another_result(direct, drive_zip: Path, fast_model: Path) -> None:
+    drive = direct.upload_drive(drive_zip)
+    direct.upload_model(fast_model)
+    jobs = [direct.submit(drive, preset="fast", segment=segment) for segment in ("fast", "paper", "paper")]
+    direct.run()
+    cached = [{s.cached for s in direct.stages(job) if s.name == "segment"} for job in jobs]
+    assert cached == [{False}, {False}, {True}]
+    keys = [{s.output_key for s in direct.stages(job) if s.name == "segment"} for job in jobs]
+    assert keys[0] != keys[1] == keys[2]
+
+
 def zip_of(path: Path, members: dict[str, bytes]) -> Path:
     with zipfile.ZipFile(path, "w") as archive:
         for name, data in members.items():

@@ -137,6 +137,10 @@ def test_cells_part_what_pixels_part(seed):
     wanted = np.zeros(mask.shape, np.int32)
     for k, members in enumerate(cut_by_pixel(pixel_affinity(strength, mask), 60), 1):
         wanted[tuple(axis[members] for axis in np.nonzero(mask))] = k
+    _, near = cv2.distanceTransformWithLabels(
+        (wanted == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    wanted[mask] = wanted[wanted > 0][near[mask] - 1]
     found = cut(strength, mask, 60)
     assert large(found) == wanted.max() == len(centres)
     same_segments(found, wanted, 0.85)
