@@ -110,7 +110,7 @@ def primal_labels(
 
         weight = np.asarray(1 / (1 + (weighing.near / depth[seen]) ** 2), dtype=np.float32)
         if weighing.edge:
-            weight *= _edge_weight(image.semantic, weighing.edge)[row, column]
+            weight *= _edge_weight(image.votes, weighing.edge)[row, column]
         if weighing.occlusion is not None:
             weight[is_hidden(uv[seen], depth[seen], intrinsic, image.size, weighing.occlusion)] = 0
         gathered.add(np.flatnonzero(seen), _probabilities(image, row, column, weighing.label), weight)
@@ -178,7 +178,7 @@ def _probabilities(
     image: PanopticImage, row: NDArray[np.intp], column: NDArray[np.intp], label: float
 ) -> NDArray[np.float32]:
     """(n, 17) float32 vote of some pixels, adding up to 1; the label alone where the image has no scores."""
-    certain = np.eye(len(NUSCENES16.classes), dtype=np.float32)[image.semantic[row, column]]
+    certain = np.eye(len(NUSCENES16.classes), dtype=np.float32)[image.votes[row, column]]
     if image.scores is None:
         return certain
     return label * certain + (1 - label) * image.scores.at(row, column)

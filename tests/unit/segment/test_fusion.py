@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from l3ps.segment.panoptic import fuse
+from l3ps.segment.panoptic import ALIKE, fuse
 from l3ps.taxonomy import NUSCENES16
 
-CAR, PEDESTRIAN, ROAD = 4, 7, 11
+BUS, CAR, PEDESTRIAN, TRUCK, ROAD = 3, 4, 7, 10, 11
 
 
 def plainly_fused(semantic, interior, floor):
@@ -29,6 +29,20 @@ def plainly_fused(semantic, interior, floor):
         return np.zeros_like(semantic), np.zeros_like(instance)
     source = nearest(~dropped)
     return semantic[source], instance[source]
+
+
+def plainly_agreed(semantic, interior):
+    """What the boundary holds together takes the class of most of its pixels, among classes built alike."""
+    semantic = semantic.copy()
+    for group in ALIKE:
+        of_group = np.isin(semantic, group)
+        number, parts = cv2.connectedComponents((of_group & interior).astype(np.uint8), connectivity=8)
+        _, blobs = cv2.connectedComponents(of_group.astype(np.uint8), connectivity=8)
+        if number > 1:
+            parts = np.where(of_group & np.isin(blobs, blobs[parts > 0]), parts[nearest(parts > 0)], 0)
+        for part in range(1, number):
+            semantic[parts == part] = np.bincount(semantic[parts == part]).argmax()
+    return semantic
 
 
 def nearest(mask):
@@ -60,7 +74,8 @@ def test_only_what_is_there_is_looked_at_and_nothing_else_comes_out(seed, cut):
     semantic, interior = scene(seed)
     floor = [0, 6, 40, 300][seed % 4]
     panoptic = fuse(semantic, (160, 90), interior=interior if cut else None, min_area=floor / semantic.size)
-    wanted = plainly_fused(semantic, interior if cut else np.ones_like(interior), floor)
+    agreed = plainly_agreed(semantic, interior) if cut else semantic
+    wanted = plainly_fused(agreed, interior if cut else np.ones_like(interior), floor)
     np.testing.assert_array_equal(panoptic.semantic, wanted[0])
     np.testing.assert_array_equal(panoptic.instance, wanted[1])
 
@@ -79,3 +94,29 @@ def test_the_input_is_left_as_it_was():
     fuse(semantic, (160, 90), interior=interior, min_area=0.01)
     np.testing.assert_array_equal(semantic, kept[0])
     np.testing.assert_array_equal(interior, kept[1])
+
+
+def patchwork():
+    """A truck of which a quarter was taken for a bus, a car touching it, and a pedestrian before it."""
+    semantic = np.full((40, 60), ROAD, np.uint8)
+    semantic[10:30, 5:35] = TRUCK
+    semantic[10:20, 5:20] = BUS
+    semantic[20:30, 35:55] = CAR
+    semantic[15:30, 10:14] = PEDESTRIAN
+    interior = np.ones(semantic.shape, bool)
+    interior[10:30, 34:36] = False
+    return semantic, interior
+
+
+def test_what_the_boundary_holds_together_is_one_object_of_one_class():
+    semantic, interior = patchwork()
+    panoptic = fuse(semantic, (60, 40), interior=interior)
+    assert (panoptic.semantic[semantic == BUS] == TRUCK).all()
+    assert len(np.unique(panoptic.instance[panoptic.semantic == TRUCK])) == 1
+    assert (panoptic.semantic[:, 36:] == semantic[:, 36:]).all(), "the car lies behind a boundary"
+    assert ((panoptic.semantic == PEDESTRIAN) == (semantic == PEDESTRIAN)).all(), "no class of its kind"
+
+
+def test_without_a_boundary_nobody_says_that_they_are_one_object():
+    semantic, _ = patchwork()
+    assert (fuse(semantic, (60, 40)).semantic == semantic).all()
