@@ -64,7 +64,8 @@ def _list(documents: list[dict[str, Any]]) -> None:
 
 def _show(job: dict[str, Any]) -> None:
     out.print(f"{job['id']}: {job['state']}, {100 * job['progress']:.0f} % done", highlight=False)
-    out.print(f"{job['drive']['name']} with {job['model']['name']}, preset {job['preset']}", highlight=False)
+    ways = f"preset {job['preset']}, segment {job['segment']}"
+    out.print(f"{job['drive']['name']} with {job['model']['name']}, {ways}", highlight=False)
     for problem in job.get("errors") or []:
         out.print(f"  {problem['where']}: {problem['what']}. {problem['remedy']}", style="red", markup=False)
     out.print(stage_table(job))

@@ -13,9 +13,20 @@ import typer
 from typer.core import TyperGroup
 
 COMMANDS = (
-    "label", "evaluate", "draw", "simulate", "simulate-images", "bench", "ablate", "up", "submit", "jobs", "download",
+    "label",
+    "evaluate",
+    "draw",
+    "simulate",
+    "simulate-images",
+    "bench",
+    "ablate",
+    "model",
+    "up",
+    "submit",
+    "jobs",
+    "download",
     "demo",
-)  # fmt: skip
+)
 """In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands; a
 hyphen of the name is an underscore there."""
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from l3ps.errors import DriveLogError, InputError, Problem
 from l3ps.presets import PRESETS
+from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.errors import INTERRUPTED
@@ -26,6 +27,7 @@ def submit(
     *,
     model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
+    segment: Annotated[str, typer.Option(help=f"Look at images: {', '.join(SEGMENT_PRESETS)}.")] = DEFAULT_SEGMENT,
     formats: Annotated[
         list[str] | None, typer.Option("--format", help="Label format: nuscenes, semantickitti; may be repeated.")
     ] = None,
@@ -44,7 +46,7 @@ def submit(
     """
     with service_errors(), Client() as client:
         check_log(log)
-        _check_settings(preset, formats, protocol)
+        _check_settings(preset, segment, formats, protocol)
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
         job = create_job(
@@ -52,6 +54,7 @@ def submit(
             drive["id"],
             model=model_name,
             preset=preset,
+            segment=segment,
             formats=formats,
             protocol=protocol,
             skip_bad_scans=skip_bad_scans,
@@ -69,13 +72,14 @@ def submit(
         require_success(job)
 
 
-def _check_settings(preset: str, formats: list[str] | None, protocol: str | None) -> None:
+def _check_settings(preset: str, segment: str, formats: list[str] | None, protocol: str | None) -> None:
     """InputError for what the service would refuse only once a large log has been sent."""
     from l3ps.evaluate import PROTOCOLS
     from l3ps.labels import FORMATS
 
     asked: list[tuple[str, str, Sequence[str]]] = [
         ("--preset", preset, list(PRESETS)),
+        ("--segment", segment, list(SEGMENT_PRESETS)),
         ("--protocol", protocol or "nuscenes", list(PROTOCOLS)),
         *(("--format", one, FORMATS) for one in formats or ()),
     ]
@@ -91,6 +95,7 @@ def create_job(
     *,
     model: str,
     preset: str,
+    segment: str = DEFAULT_SEGMENT,
     formats: list[str] | None = None,
     protocol: str | None = None,
     skip_bad_scans: bool = False,
@@ -100,6 +105,7 @@ def create_job(
         "drive_id": drive_id,
         "model": model,
         "preset": preset,
+        "segment": segment,
         "skip_bad_scans": skip_bad_scans,
     }
     if formats:

@@ -12,8 +12,7 @@ import structlog
 from l3ps.drivelog import Drive, open_drive, unpack, validate, without_bad_scans
 from l3ps.errors import DriveLogError, InputError, Problem
 from l3ps.progress import Progress
-from l3ps.segment.bundle import ModelBundle
-from l3ps.segment.session import Segmenter
+from l3ps.segment.check import check_bundle
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, Json, ModelRow, bundles, drives
 from l3ps_platform.errors import StoreError
@@ -75,8 +74,7 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
         sha256 = download(context, row.object_key, archive, row.size, progress)
         try:
             _check_claim(row.sha256, sha256, row.filename)
-            bundle = ModelBundle.load(archive)
-            Segmenter(bundle, context.settings.threads)  # onnxruntime reads the graph here
+            report = check_bundle(archive, threads=context.settings.threads, progress=progress)
         except InputError as error:
             problems = [_without_path(problem, folder, row.filename) for problem in error.problems]
             log.info("model rejected", problems=[str(problem) for problem in problems])
@@ -84,13 +82,12 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
                 lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=problems, sha256=sha256),
                 afterwards=lambda: _delete(context, row.object_key),
             )
-    spec = bundle.info.input
     info: Json = {
-        "name": bundle.info.name,
-        "label_space": bundle.info.label_space,
-        "classes": list(bundle.info.classes),
-        "input": [spec.height, spec.width],
-        "has_boundary": bundle.info.output.boundary is not None,
+        "name": report.name,
+        "label_space": report.label_space,
+        "classes": list(report.classes),
+        "input": report.graphs[0].input[2:],
+        "has_boundary": report.boundary,
     }
     return Done(lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=[], sha256=sha256, info=info))
 

@@ -15,13 +15,16 @@ from typing import Any
 import l3ps
 from l3ps.presets import Preset
 from l3ps.refine.cluster import build
+from l3ps.segment.presets import SegmentPreset
 
 _ROOT = Path(l3ps.__path__[0])
 _SEGMENTATION = ("segment", "drivelog", "project.py", "geometry.py", "taxonomy.py", "pipeline.py", "labels/types.py")
 _NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
 
 
-def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset, *, skip: bool) -> str:
+def segment_key(
+    drive_sha256: str, model_sha256: str, scene: str, preset: Preset, look: SegmentPreset, *, skip: bool
+) -> str:
     """Key of a scene's primal labels."""
     return _key(
         "segment",
@@ -29,6 +32,7 @@ def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset
         model=model_sha256,
         scene=scene,
         min_area=preset.min_area,
+        look=look.as_dict(),
         skip=skip,
         code=code_version(_SEGMENTATION),
     )

@@ -12,6 +12,7 @@ from l3ps.drivelog import Drive, Scene, UnpackLimits, open_drive, unpack, valida
 from l3ps.errors import ProcessingError
 from l3ps.presets import PRESETS, Preset
 from l3ps.progress import Progress
+from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
 from l3ps_platform.errors import ObjectMissing
@@ -59,6 +60,14 @@ class SceneWork:
         if name not in PRESETS:
             raise ProcessingError(f"this worker knows no preset {name!r}; it knows {', '.join(PRESETS)}")
         return PRESETS[name]
+
+    @property
+    def look(self) -> SegmentPreset:
+        """The job's way to look at images; jobs of before there was a choice have none set."""
+        name = self.job.settings.get("segment", DEFAULT_SEGMENT)
+        if name not in SEGMENT_PRESETS:
+            raise ProcessingError(f"this worker knows no segmentation {name!r}; it knows {', '.join(SEGMENT_PRESETS)}")
+        return SEGMENT_PRESETS[name]
 
     @property
     def skip(self) -> bool:

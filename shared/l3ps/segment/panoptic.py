@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from l3ps.segment.scores import ClassScores
 from l3ps.taxonomy import NUSCENES16, VOID
 
 ALIKE: Final = tuple(
@@ -23,38 +24,8 @@ ALIKE: Final = tuple(
 )
 """Classes of things built alike, which a network takes for one another within one object."""
 
-
-@dataclass(frozen=True, slots=True)
-class ClassScores:
-    """The network's raw scores, made probabilities only where a point asks.
-
-    A scan's points meet one pixel in fifty: a softmax over the whole picture would cost as much as a tenth of the
-    network and 17 planes of memory.
-
-    Attributes:
-        logits: (K, h, w) float32, one plane a class of the network.
-        classes: (K,) uint8 ``NUSCENES16`` class of each plane; several planes may share one.
-    """
-
-    logits: NDArray[np.float32]
-    classes: NDArray[np.uint8]
-
-    def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Class probabilities of some pixels.
-
-        Args:
-            row, column: (n,) pixel indices.
-
-        Returns:
-            (n, 17) float32 that add up to 1: the softmax over the network's classes, added up over those that share a
-            class.
-        """
-        scores = self.logits[:, row, column]
-        scores = np.exp(scores - scores.max(axis=0))
-        merged = np.zeros((len(NUSCENES16.classes), len(row)), dtype=np.float32)
-        for plane, index in zip(scores, self.classes, strict=True):
-            merged[index] += plane
-        return np.ascontiguousarray((merged / merged.sum(axis=0)).T)
+Window = tuple[slice, slice]
+"""Rows and columns of a part of an image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +131,7 @@ def agree(semantic: NDArray[np.uint8], interior: NDArray[np.bool_]) -> None:
         found[member] = votes.argmax(axis=1).astype(np.uint8)[part]
 
 
-def thing_masks(semantic: NDArray[np.uint8]) -> Iterator[tuple[tuple[slice, slice], NDArray[np.uint8]]]:
+def thing_masks(semantic: NDArray[np.uint8]) -> Iterator[tuple[Window, NDArray[np.uint8]]]:
     """Each thing class of an image that occurs in it: the window that holds it, and where it is there (0 or 1)."""
     present = cv2.calcHist([semantic], [0], None, [256], [0, 256]).ravel() > 0
     for thing in sorted(NUSCENES16.things):
@@ -193,7 +164,7 @@ def fill(semantic: NDArray[np.uint8], instance: NDArray[np.int32], holes: NDArra
         window, inner = _widened(box, 1, holes.shape)
         rows, columns = np.nonzero(member)
         rows, columns = rows + inner[0], columns + inner[1]
-        source, _ = _nearest(holes[window] ^ np.uint8(1), rows, columns)
+        source, _ = nearest(holes[window] ^ np.uint8(1), rows, columns)
         semantic[window][rows, columns] = semantic[window][source]
         instance[window][rows, columns] = instance[window][source]
 
@@ -226,13 +197,13 @@ def _grow(
         rows, columns = np.nonzero(wanted[box] & member)
         if not len(rows):
             continue
-        source, distance = _nearest(core[box], rows, columns)
+        source, distance = nearest(core[box], rows, columns)
         view = labels[box]
         # Another blob's core may be nearer than the own blob's.
         window, inner = _widened(box, int(distance.max()), core.shape)
         if cv2.countNonZero(core[window]) > cv2.countNonZero(core[box]):
             rows, columns = rows + inner[0], columns + inner[1]
-            source, _ = _nearest(core[window], rows, columns)
+            source, _ = nearest(core[window], rows, columns)
             view = labels[window]
         found = view[source]
         view[rows, columns] = found
@@ -246,9 +217,7 @@ def _blobs(mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32
     return np.asarray(labels, dtype=np.int32), np.asarray(stats[1:, :4], dtype=np.int32)
 
 
-def _windows(
-    blobs: NDArray[np.int32], boxes: NDArray[np.int32]
-) -> Iterator[tuple[tuple[slice, slice], NDArray[np.bool_]]]:
+def _windows(blobs: NDArray[np.int32], boxes: NDArray[np.int32]) -> Iterator[tuple[Window, NDArray[np.bool_]]]:
     """The window of each blob and the blob's pixels in it; all blobs as one where that is the less to look at."""
     if len(boxes) > 500 or (boxes[:, 2] * boxes[:, 3]).sum() > blobs.size:
         yield np.s_[0 : blobs.shape[0], 0 : blobs.shape[1]], blobs > 0
@@ -258,9 +227,7 @@ def _windows(
         yield box, blobs[box] == k
 
 
-def _widened(
-    box: tuple[slice, slice], margin: int, shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], tuple[int, int]]:
+def _widened(box: Window, margin: int, shape: tuple[int, ...]) -> tuple[Window, tuple[int, int]]:
     """A window with a margin, cut at the image's edge, and where in it the old one begins (row, column)."""
     rows, columns = (
         slice(max(0, side.start - margin), min(length, side.stop + margin))
@@ -269,7 +236,7 @@ def _widened(
     return (rows, columns), (box[0].start - rows.start, box[1].start - columns.start)
 
 
-def _nearest(
+def nearest(
     mask: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp]
 ) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.float32]]:
     """The nearest pixel of a mask, as rows and columns, to each of some pixels, and how far it is (OpenCV)."""

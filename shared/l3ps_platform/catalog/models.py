@@ -155,7 +155,7 @@ class ModelRow(Base):
 class JobRow(Base):
     """One labelling of one drive with one model.
 
-    ``settings``: ``{"preset", "formats": […], "protocol", "skip_bad_scans"}``.
+    ``settings``: ``{"preset", "segment", "formats": […], "protocol", "skip_bad_scans"}``.
     ``error``: ``{"message", "problems": […]}``. ``quality``: ``{"protocol", "primal": {…}, "refined": {…}}`` with
     ``Quality.as_dict()`` of each, or None where the log has no truth.
     """

@@ -98,8 +98,8 @@ def slow_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def stuck_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seconds an image: it will not finish a scene while a test waits."""
-    return bundle_zip(tmp_path_factory.mktemp("model") / "stuck.zip", 150, 512, 512)
+    """About a second an image: passes its check in time, but will not finish a scene while a test waits."""
+    return bundle_zip(tmp_path_factory.mktemp("model") / "stuck.zip", 60, 512, 512)
 
 
 @pytest.fixture(scope="session")

@@ -195,7 +195,7 @@ def test_a_model_whose_graph_does_not_load_is_rejected(direct, fast_model: Path,
         info = good.read("model.json")
     model = direct.upload_model(zip_of(tmp_path / "m.zip", {"model.json": info, "model.onnx": b"garbage"}))
     direct.run()
-    assert "cannot load the graph" in direct.model(model).problem["problems"][0]["what"]
+    assert "it is no ONNX graph" in direct.model(model).problem["problems"][0]["what"]
 
 
 class TestStopping:
