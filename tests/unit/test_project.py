@@ -108,6 +108,14 @@ def test_probabilities_are_carried_and_share_the_vote_with_the_label():
     assert dict(zip(evidence.classes[0].tolist(), evidence.weights[0].tolist(), strict=True)) == {4: 58, 10: 33, 0: 8}
 
 
+def test_a_pixel_votes_for_itself_whatever_class_its_object_took():
+    car, truck = (np.full((10, 20), label, np.uint8) for label in (4, 10))
+    image = PanopticImage(truck, np.ones((10, 20), np.int32), SIZE, painted=car)
+    semantic, _, evidence = primal_labels(np.array([[10, 0, 0]], np.float32), [(image, FORWARD, K)])
+    assert semantic.tolist() == [10]
+    assert evidence.classes[:, 0].tolist() == [4]
+
+
 def test_a_vote_from_a_label_edge_counts_less():
     semantic = np.full((10, 20), 11, np.uint8)
     semantic[:, :10] = 4

@@ -115,6 +115,7 @@ def test_what_the_boundary_holds_together_is_one_object_of_one_class():
     assert len(np.unique(panoptic.instance[panoptic.semantic == TRUCK])) == 1
     assert (panoptic.semantic[:, 36:] == semantic[:, 36:]).all(), "the car lies behind a boundary"
     assert ((panoptic.semantic == PEDESTRIAN) == (semantic == PEDESTRIAN)).all(), "no class of its kind"
+    assert (panoptic.votes == semantic).all(), "what each pixel said by itself is kept"
 
 
 def test_without_a_boundary_nobody_says_that_they_are_one_object():
