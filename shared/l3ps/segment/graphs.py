@@ -21,8 +21,10 @@ MAX_ELEMENTS = 1 << 31
 
 STANDARD = frozenset({"", "ai.onnx", "ai.onnx.ml"})
 RUNTIME_DOMAIN = "com.microsoft"
-RUNTIME_OPERATORS = frozenset({"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "FusedMatMul", "Gelu", "QuickGelu"})
-"""Operators of onnxruntime's own that its quantisation and graph optimisation write."""
+RUNTIME_OPERATORS = frozenset(
+    {"DynamicQuantizeMatMul", "MatMulIntegerToFloat", "FusedMatMul", "Gelu", "QuickGelu", "MultiHeadAttention"}
+)
+"""Operators of onnxruntime's own: what its quantisation and graph optimisation write, and the attention of our ViTs."""
 _INT8 = frozenset({"MatMulInteger", "ConvInteger", "QLinearMatMul", "QLinearConv", "DequantizeLinear"})
 _INT8_OPERATORS = _INT8 | {"DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
 
