@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from l3ps.errors import ProcessingError
 
 from .backbones import Backbone, OnnxGraph
+from .commute import convolve_before_enlarging
 from .heads import Heads
 
 OPSET = 18
@@ -178,6 +179,7 @@ def _merged(network: Network, backbone: OnnxGraph) -> onnx.ModelProto:
         compose.add_prefix(heads, "heads/", rename_inputs=True, rename_outputs=False),
         io_map=[(f"backbone/{backbone.output}", "heads/features")],
     )
+    convolve_before_enlarging(merged, f"backbone/{backbone.output}")
     onnx.checker.check_model(merged)
     return merged
 
