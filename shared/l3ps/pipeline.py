@@ -14,6 +14,7 @@ out: no service, queue, database or terminal is known here. Progress goes throug
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,6 @@ from l3ps.refine.ground import GroundSegmenter
 from l3ps.refine.identify import VotedScan, identify
 from l3ps.refine.poses import Motion, PoseTracker
 from l3ps.refine.verdict import decide
-from l3ps.segment.images import read_rgb
 from l3ps.segment.session import Segmenter
 
 REFINE_STAGES = ("accumulate", "ground", "cluster", "vote", "instances")
@@ -68,7 +68,7 @@ def primal_labels(scene: Scene, segmenter: Segmenter, progress: Progress = silen
     """Labels of a scene's scans straight from the images (paper, section III-C).
 
     Args:
-        scene: the scene; each scan's points and images are read once and let go.
+        scene: the scene; each scan's points and images are read once and let go, images a few ahead.
         segmenter: the 2D network.
         progress: told after each image.
 
@@ -78,17 +78,18 @@ def primal_labels(scene: Scene, segmenter: Segmenter, progress: Progress = silen
     Raises:
         DriveLogError: when a scan or image cannot be read.
     """
-    total = sum(len(scan.cameras) for scan in scene.scans)
+    paths = [camera.path for scan in scene.scans for camera in scan.cameras]
     done = 0
 
     def views(scan: Scan) -> Iterator[project.View]:
         nonlocal done
-        for camera in scan.cameras:  # one image's scores at a time: they are the largest arrays of all
-            yield segmenter.segment(read_rgb(camera.path)), scan.lidar_to_camera(camera), camera.intrinsic
+        for camera in scan.cameras:
+            yield next(images), scan.lidar_to_camera(camera), camera.intrinsic
             done += 1
-            progress("segment", done, total)
+            progress("segment", done, len(paths))
 
-    return [ScanLabels(scan.token, *project.primal_labels(scan.load_points().xyz, views(scan))) for scan in scene.scans]
+    with closing(segmenter.stream(paths)) as images:
+        return [ScanLabels(s.token, *project.primal_labels(s.load_points().xyz, views(s))) for s in scene.scans]
 
 
 def refine_scene(

@@ -11,16 +11,16 @@ import re
 import secrets
 import threading
 import time
-from typing import Literal
+from typing import Literal, get_args
 
-Prefix = Literal["drv", "job", "upl", "mdl", "scn", "stg"]
+Prefix = Literal["ann", "drv", "job", "upl", "mdl", "scn", "stg", "trn"]
 
 _ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
 _RANDOM_BITS = 74
 _LENGTH = 25
 _lock = threading.Lock()
 _last = 0
-_PATTERN = re.compile(rf"(drv|job|upl|mdl|scn|stg)_[{_ALPHABET}]{{{_LENGTH}}}")
+_PATTERN = re.compile(rf"({'|'.join(get_args(Prefix))})_[{_ALPHABET}]{{{_LENGTH}}}")
 
 
 def new_id(prefix: Prefix) -> str:

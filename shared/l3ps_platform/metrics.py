@@ -98,10 +98,13 @@ def _states(session: Session) -> list[Metric]:
     jobs = GaugeMetricFamily("l3ps_jobs", "Jobs by state.", labels=["state"])
     for state, count in figures.job_states(session).items():
         jobs.add_metric([state.value], count)
+    trainings = GaugeMetricFamily("l3ps_trainings", "Trainings by state.", labels=["state"])
+    for state, count in figures.training_states(session).items():
+        trainings.add_metric([state.value], count)
     stages = GaugeMetricFamily("l3ps_stages", "Stages by name and state.", labels=["stage", "state"])
     for (name, stage_state), count in figures.stage_states(session).items():
         stages.add_metric([name.value, stage_state.value], count)
-    return [jobs, stages]
+    return [jobs, trainings, stages]
 
 
 def _oldest(session: Session, catalog: Catalog) -> Metric:

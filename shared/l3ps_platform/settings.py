@@ -83,6 +83,7 @@ class Settings(BaseSettings):
 
     max_upload_bytes: int = 64 * GiB
     max_model_bytes: int = 512 * MiB
+    max_annotations_bytes: int = 8 * GiB  # a training needs tens of images, whole data sets bring thousands
     part_bytes: int = 16 * MiB  # at least; larger where an upload would need more than S3's 10,000 parts
     upload_ttl_seconds: int = 24 * 3600  # an upload not completed by then is aborted and its parts deleted
     url_ttl_seconds: int = 3600
@@ -100,6 +101,9 @@ class Settings(BaseSettings):
     resend_seconds: float = 30.0
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
+    # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis
+    # would deliver the message a second time.
+    train_seconds: float = Field(default=20 * 3600.0, gt=0, lt=24 * 3600)
     progress_seconds: float = 0.5
 
     threads: int = 2  # of numeric libraries, per worker process
@@ -108,6 +112,13 @@ class Settings(BaseSettings):
     # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping
     # chunks. At 300 bytes a point (l3ps.refine.chunks) this holds 28 million points, 600 keyframes of nuScenes.
     refine_bytes: int = Field(default=8 * GiB, gt=0)
+
+    # Whether a worker serves the queue `train`: it needs the trainer, which needs torch, so not every service has one.
+    training: bool = False
+    # Pretrained backbones by name, on the machine of that worker: NAME.onnx, a folder NAME of several graphs, or
+    # weights NAME.pth. Clients name them and never a path.
+    backbones_dir: Path | None = None  # None: data_dir/backbones
+    checkpoint_seconds: float = 30.0  # how often a training's checkpoint and log go to the object store
 
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
@@ -156,6 +167,11 @@ class Settings(BaseSettings):
     def scratch(self) -> Path:
         """Where workers unpack."""
         return self.scratch_dir or self.data_dir / "scratch"
+
+    @property
+    def backbones(self) -> Path:
+        """Where the backbones lie."""
+        return self.backbones_dir or self.data_dir / "backbones"
 
     @property
     def broker_url(self) -> str:

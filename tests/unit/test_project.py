@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l3ps.project import Weighing, primal_labels, project
-from l3ps.segment.panoptic import ClassScores, PanopticImage
+from l3ps.segment.panoptic import PanopticImage
+from l3ps.segment.scores import ClassScores
 
 SIZE = (200, 100)
 K = np.array([[100.0, 0, 100], [0, 100, 50], [0, 0, 1]])

@@ -13,6 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 from prometheus_client import CollectorRegistry
 
 from l3ps_api import errors, problems
+from l3ps_api.annotation_sets.routes import router as annotation_sets
 from l3ps_api.auth import require_token
 from l3ps_api.drives.routes import router as drives
 from l3ps_api.jobs.routes import router as jobs
@@ -22,6 +23,7 @@ from l3ps_api.models.routes import router as models
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
+from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads.routes import router as uploads
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
@@ -40,6 +42,9 @@ Drive logs in, panoptic labels on every LiDAR point out.
 1. `POST /v1/uploads` announces an archive; `PUT` its parts to the URLs answered; `POST …/complete` makes it a drive.
 2. `POST /v1/jobs` labels a drive with a model; `GET /v1/jobs/{id}` shows progress, cost and quality.
 3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs.
+
+A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
+`GET /v1/trainings/{id}` shows progress, log and report.
 
 Every error is a problem document (RFC 9457) that names the field at fault and the remedy.
 """
@@ -60,7 +65,7 @@ def create_app(settings: Settings) -> FastAPI:
     guarded = [Depends(require_token)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    for router in (uploads, drives, jobs, labels, models):
+    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.

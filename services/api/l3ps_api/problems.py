@@ -77,12 +77,13 @@ def stored_items(problems: Iterable[Mapping[str, Any]] | None) -> list[ErrorItem
 
 def unknown(kind: str, identifier: str, where: str = "path") -> ApiProblem:
     """404 for an id that names nothing; ``where`` it was given."""
+    all_of_them = f"/v1/{kind.removesuffix('s')}s"
     return ApiProblem(
         404,
         f"unknown-{kind}",
         f"Unknown {kind}",
-        f"There is no {kind} {identifier!r}. GET /v1/{kind}s lists those there are.",
-        [ErrorItem(where=where, what=f"no {kind} has the id {identifier!r}", remedy=f"Use an id from /v1/{kind}s.")],
+        f"There is no {kind} {identifier!r}. GET {all_of_them} lists those there are.",
+        [ErrorItem(where=where, what=f"no {kind} has the id {identifier!r}", remedy=f"Use an id from {all_of_them}.")],
     )
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +13,11 @@ from rich.table import Table
 
 from l3ps.drivelog import opened
 from l3ps.drivelog.types import Drive, Scene
-from l3ps.errors import DriveLogError, Problem, ProcessingError
+from l3ps.errors import DriveLogError, Problem
 from l3ps.presets import DEFAULT_PRESET, PRESETS
-from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out
+from l3ps_cli.bench_run import run_task
+from l3ps_cli.bench_segment import segment
+from l3ps_cli.errors import BAD_INPUT, clear_errors, fail, out
 
 app = typer.Typer(help="Measure on your own logs.", no_args_is_help=True)
 
@@ -29,6 +29,9 @@ GROWTH = (1, 2, 4, 8, 16)
 @app.callback()
 def bench() -> None:
     """Measure on your own logs."""
+
+
+app.command()(segment)
 
 
 @app.command()
@@ -84,18 +87,18 @@ def _figures(
     total = len(scene.scans)
     taken = min(scans or total, total)
     common = {"root": str(drive.root), "scene": scene.name, "preset": preset, "threads": threads}
-    own = _child("refinement", f"Refining {taken} scans three times", folder, {**common, "scans": taken})
+    own = run_task("refinement", f"Refining {taken} scans three times", folder, {**common, "scans": taken})
     seconds: dict[str, float | None] = {"l3ps": own.pop("clustering"), **dict.fromkeys(PEERS)}
     rows: list[dict[str, float]] = []
     if growth:
         sizes = [size for size in GROWTH if size <= total]
         what = f"Refining {', '.join(map(str, sizes))} scans, three times each"
-        rows = _child("growth", what, folder, {**common, "sizes": sizes})["growth"]
+        rows = run_task("growth", what, folder, {**common, "sizes": sizes})["growth"]
     size = PRESETS[preset].min_cluster_size
     for name in PEERS if peers else ():
         if importlib.util.find_spec(name) is not None:
             what = f"Clustering the same {own['points']:,} points with {name}: takes minutes for a million"
-            seconds[name] = _child(name, what, folder, {"size": size, "threads": threads})["seconds"]
+            seconds[name] = run_task(name, what, folder, {"size": size, "threads": threads})["seconds"]
     figures = {"scene": scene.name, "preset": preset, "threads": threads, **own, "clustering": seconds, "growth": rows}
     return figures | {"ratios": _ratios(seconds, figures["seconds"], rows)}
 
@@ -111,24 +114,6 @@ def _ratios(
         "refine_vs_fast_hdbscan_clustering": fast / refinement if fast else None,
         "growth_1_to_max": growth[-1]["us_a_point"] / growth[0]["us_a_point"] if growth else None,
     }
-
-
-def _child(task: str, what: str, folder: Path, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Run a task of :mod:`l3ps_cli.bench_tasks` in a fresh process, whose memory nothing else has touched."""
-    err.print(f"{what} …", highlight=False, soft_wrap=True)
-    (folder / "arguments.json").write_text(json.dumps(arguments))
-    done = subprocess.run(
-        [sys.executable, "-m", "l3ps_cli.bench_tasks", task, str(folder)], stdout=subprocess.DEVNULL, check=False
-    )
-    answer = folder / f"{task}.json"
-    if done.returncode != 0 or not answer.is_file():
-        raise ProcessingError(f"the measurement '{task}' ended with code {done.returncode}; is there memory enough?")
-    result: dict[str, Any] = json.loads(answer.read_text())
-    if "problems" in result:
-        raise DriveLogError(Problem(**problem) for problem in result["problems"])
-    if "error" in result:
-        raise ProcessingError(result["error"])
-    return result
 
 
 def _show(figures: dict[str, Any]) -> None:

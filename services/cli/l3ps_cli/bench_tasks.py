@@ -179,11 +179,12 @@ TASKS: dict[str, Callable[..., dict[str, Any]]] = {
 def main() -> None:
     """Run one task; an error of ours becomes its answer."""
     from l3ps.errors import InputError, L3psError
+    from l3ps_cli import bench_segment_tasks
 
     task, folder = sys.argv[1], Path(sys.argv[2])
     arguments = json.loads((folder / "arguments.json").read_text())
     try:
-        answer = TASKS[task](folder, **arguments)
+        answer = (TASKS | bench_segment_tasks.TASKS)[task](folder, **arguments)
     except InputError as error:
         answer = {"problems": [problem.as_dict() for problem in error.problems]}
     except L3psError as error:

@@ -100,13 +100,13 @@ class Client:
 
         Args:
             file: the archive.
-            kind: ``drive`` or ``model``.
+            kind: ``drive``, ``model`` or ``annotations``.
             sha256: hex digest of the file.
-            name: what the drive or model is to be called.
+            name: what the drive, model or annotations are to be called.
             report: called with bytes newly sent (negative when a part starts over), from several threads.
 
         Returns:
-            The drive or model document.
+            The document of what was uploaded.
         """
         opened = self.post(
             "/uploads", {"kind": kind, "filename": file.name, "size": file.stat().st_size, "sha256": sha256}

@@ -31,6 +31,7 @@ def demo(
     ] = None,
     model: Annotated[Path | None, typer.Option(help="Model bundle; default: the packaged demo model.")] = None,
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
+    segment: Annotated[str, typer.Option(help="Look at images: fast, balanced or paper.")] = "fast",
     data: Annotated[Path, typer.Option(help="Directory for everything the demo makes.", file_okay=False)] = Path(
         "demo"
     ),
@@ -45,13 +46,13 @@ def demo(
                 check_log(drive)
             log = drive or _simulated(data / "drive")
             with Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack, Client(stack.url) as client:
-                job = _run(client, stack, log, model or DEMO_MODEL, preset)
+                job = _run(client, stack, log, model or DEMO_MODEL, preset, segment)
                 labels = data / "labels" / job["id"]
                 fetch_labels(client, job["id"], labels)
     except StopRequested:
         fail("The demo was stopped; the service it had started is gone.", JOB_FAILED)
     except ChildDiedError as error:
-        fail(f"{error}. Its last lines:\n{error.child.last_lines()}", JOB_FAILED)
+        fail(f"{error}. Its last lines:\n{error.last_lines}", JOB_FAILED)
     except (StackError, TimeoutError, DamagedDownloadError) as error:
         fail(str(error), JOB_FAILED)
     out.print(stage_table(job))
@@ -65,10 +66,10 @@ def demo(
     out.print(f"{time.monotonic() - start:.0f} seconds in all", highlight=False)
 
 
-def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str) -> dict[str, Any]:
+def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str, segment: str) -> dict[str, Any]:
     name = ensure_model(client, str(model))
     document = upload_log(client, log)
-    job = create_job(client, document["id"], model=name, preset=preset)
+    job = create_job(client, document["id"], model=name, preset=preset, segment=segment)
     job = wait_for_job(client, job["id"], err, stack.check)
     require_success(job)
     return job

@@ -12,7 +12,7 @@ from l3ps_cli.client import Client
 from l3ps_cli.console import out, service_errors
 from l3ps_cli.report import quality_table, stage_table
 
-_COLORS = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
+COLORS = {"succeeded": "green", "failed": "red", "cancelled": "yellow", "running": "cyan"}
 
 
 def jobs(
@@ -55,7 +55,7 @@ def _list(documents: list[dict[str, Any]]) -> None:
             job["drive"]["name"],
             job["model"]["name"],
             job["preset"],
-            f"[{_COLORS.get(job['state'], 'white')}]{job['state']}[/]",
+            f"[{COLORS.get(job['state'], 'white')}]{job['state']}[/]",
             f"{100 * job['progress']:.0f} %",
             f"{refined['pq']:.1f}" if refined else "",
         )
@@ -64,7 +64,8 @@ def _list(documents: list[dict[str, Any]]) -> None:
 
 def _show(job: dict[str, Any]) -> None:
     out.print(f"{job['id']}: {job['state']}, {100 * job['progress']:.0f} % done", highlight=False)
-    out.print(f"{job['drive']['name']} with {job['model']['name']}, preset {job['preset']}", highlight=False)
+    ways = f"preset {job['preset']}, segment {job['segment']}"
+    out.print(f"{job['drive']['name']} with {job['model']['name']}, {ways}", highlight=False)
     for problem in job.get("errors") or []:
         out.print(f"  {problem['where']}: {problem['what']}. {problem['remedy']}", style="red", markup=False)
     out.print(stage_table(job))

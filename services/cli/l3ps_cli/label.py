@@ -26,6 +26,7 @@ from l3ps.pipeline import RefinedScene, primal_labels, refine_scene
 from l3ps.presets import DEFAULT_PRESET, PRESETS, Preset
 from l3ps.refine.poses import Motion
 from l3ps.segment.bundle import ModelBundle
+from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS
 from l3ps.segment.session import Segmenter
 from l3ps_cli.errors import BAD_INPUT, clear_errors, err, fail, out, stopped_by_sigterm
 from l3ps_cli.progress import bars
@@ -58,6 +59,7 @@ def label(
     model: Annotated[Path, typer.Option(help="Model bundle: a directory or zip.")],
     output: Annotated[Path, typer.Option("--out", help="Folder for the labels.")],
     preset: Annotated[str, typer.Option(help=f"{', '.join(PRESETS)}.")] = DEFAULT_PRESET,
+    segment: Annotated[str, typer.Option(help=f"Look at images: {', '.join(SEGMENT_PRESETS)}.")] = DEFAULT_SEGMENT,
     label_format: Annotated[str, typer.Option("--format", help=f"{', '.join(FORMATS)}.")] = "nuscenes",
     report: Annotated[Path | None, typer.Option(help="Write costs and quality to this JSON file.")] = None,
     scene: Annotated[str | None, typer.Option(help="Only this scene.")] = None,
@@ -68,6 +70,7 @@ def label(
     """Label every LiDAR point of a drive log; with truth in the log, score the labels too."""
     with clear_errors(), stopped_by_sigterm():
         parameters = _choose(PRESETS, preset, "--preset")
+        look = _choose(SEGMENT_PRESETS, segment, "--segment")
         written_as = _choose(dict(zip(FORMATS, FORMATS, strict=True)), label_format, "--format")
         if protocol is not None:
             _choose(PROTOCOLS, protocol, "--protocol")
@@ -75,7 +78,7 @@ def label(
             report.parent.mkdir(parents=True, exist_ok=True)
             report.open("a").close()  # better to fail now than after the work
         started = time.perf_counter()
-        segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area)
+        segmenter = Segmenter(ModelBundle.load(model), threads, parameters.min_area, look)
         with opened(log) as whole, _all_or_nothing(output) as staging:
             drive = _checked(_limited(whole, scene), skip_bad_scans)
             for one in drive.scenes:
@@ -90,6 +93,7 @@ def label(
         "format": drive.format,
         "model": segmenter.bundle.info.name,
         "preset": parameters.as_dict(),
+        "segment": look.as_dict(),
         "seconds": time.perf_counter() - started,
         "scenes": run.scenes,
         "quality": {side: evaluator.quality().as_dict() for side, evaluator in run.quality.items()},

@@ -1,4 +1,4 @@
-"""The embedded stack: Redis, API and one worker as children of this process, all data in one directory.
+"""The embedded stack: Redis, API and workers as children of this process, all data in one directory.
 
 DATA/up.json      url, token and pid of the running stack; absent while none runs
 DATA/lock         held by the running stack; the kernel lets go of it however the stack ends
@@ -6,6 +6,7 @@ DATA/catalog.db   the catalog (SQLite, WAL)
 DATA/objects/     drive logs, stage outputs, labels, models
 DATA/redis/       the queue's append-only file
 DATA/scratch/     unpacked logs while a stage works on them
+DATA/backbones/   pretrained backbones that trainings may name; whoever runs the stack puts them there
 DATA/logs/        one file a child
 """
 
@@ -26,15 +27,19 @@ from typing import Any
 
 import httpx
 
-from l3ps_cli.processes import Processes, StopPlan
+from l3ps_cli.processes import Processes
+from l3ps_cli.trainer import missing
+from l3ps_platform.processes import StopPlan
 
 READY_SECONDS = 60.0
 """The API answers after 2–3 s on two idle cores; the rest is for a machine that is busy or reads a cold disk."""
 
 WORKER = (
-    *("celery", "-A", "l3ps_worker.app", "worker", "-Q", "segment,refine"),
+    *("celery", "-A", "l3ps_worker.app", "worker"),
     *("--without-gossip", "--without-mingle"),  # a lone worker need not wait a second for neighbours to answer
 )
+QUEUES, TRAINER_QUEUES = "segment,refine", "train"
+"""Of the worker, and of the one for trainings: they take minutes, and nobody's labels should wait for them."""
 
 STOP_WORKER: StopPlan = ((SIGTERM, 4.0), (SIGQUIT, 4.0))
 """A warm shutdown waits for the stage in hand, which may take minutes; the next start takes it up again anyway."""
@@ -54,6 +59,7 @@ class StackOptions:
         workers: worker processes.
         threads: threads each worker process may use.
         token: bearer token the API demands, None for none.
+        training: start a worker that trains models, where the trainer is installed.
     """
 
     data: Path
@@ -61,6 +67,12 @@ class StackOptions:
     workers: int = 1
     threads: int = 2
     token: str | None = None
+    training: bool = False
+
+    @property
+    def trains(self) -> bool:
+        """Whether models can be trained: the trainer is looked for and not imported."""
+        return self.training and not missing()
 
 
 class Stack:
@@ -120,8 +132,11 @@ class Stack:
         self.processes.start("api", [*python, "l3ps_api"], env, cwd=self.data)
         self.processes.wait_until(self._api_ready, "the API", READY_SECONDS)
         self._say("starting the worker")
-        worker = [*python, *WORKER, "-c", str(self.options.workers)]
+        worker = [*python, *WORKER, "-Q", QUEUES, "-c", str(self.options.workers)]
         self.processes.start("worker", worker, env, cwd=self.data, stop_plan=STOP_WORKER)
+        if self.options.trains:
+            trainer = [*python, *WORKER, "-Q", TRAINER_QUEUES, "-c", "1", "-n", "train@%h"]
+            self.processes.start("trainer", trainer, env, cwd=self.data, stop_plan=STOP_WORKER)
 
     def _start_redis(self) -> str:
         """Start Redis on a free loopback port behind a password; returns its URL."""
@@ -159,6 +174,7 @@ class Stack:
             "L3PS_PORT": str(port),
             "L3PS_THREADS": str(self.options.threads),
             "L3PS_CONCURRENCY": str(self.options.workers),
+            "L3PS_TRAINING": "1" if self.options.trains else "0",
             "PYTHONUNBUFFERED": "1",
         }
         env.setdefault("L3PS_LOG_FORMAT", "console")

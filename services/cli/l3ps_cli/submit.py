@@ -14,6 +14,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 
 from l3ps.errors import DriveLogError, InputError, Problem
 from l3ps.presets import PRESETS
+from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS
 from l3ps_cli.client import Client, ServiceProblemError, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.errors import INTERRUPTED
@@ -26,6 +27,7 @@ def submit(
     *,
     model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
+    segment: Annotated[str, typer.Option(help=f"Look at images: {', '.join(SEGMENT_PRESETS)}.")] = DEFAULT_SEGMENT,
     formats: Annotated[
         list[str] | None, typer.Option("--format", help="Label format: nuscenes, semantickitti; may be repeated.")
     ] = None,
@@ -44,7 +46,7 @@ def submit(
     """
     with service_errors(), Client() as client:
         check_log(log)
-        _check_settings(preset, formats, protocol)
+        _check_settings(preset, segment, formats, protocol)
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
         job = create_job(
@@ -52,6 +54,7 @@ def submit(
             drive["id"],
             model=model_name,
             preset=preset,
+            segment=segment,
             formats=formats,
             protocol=protocol,
             skip_bad_scans=skip_bad_scans,
@@ -69,13 +72,14 @@ def submit(
         require_success(job)
 
 
-def _check_settings(preset: str, formats: list[str] | None, protocol: str | None) -> None:
+def _check_settings(preset: str, segment: str, formats: list[str] | None, protocol: str | None) -> None:
     """InputError for what the service would refuse only once a large log has been sent."""
     from l3ps.evaluate import PROTOCOLS
     from l3ps.labels import FORMATS
 
     asked: list[tuple[str, str, Sequence[str]]] = [
         ("--preset", preset, list(PRESETS)),
+        ("--segment", segment, list(SEGMENT_PRESETS)),
         ("--protocol", protocol or "nuscenes", list(PROTOCOLS)),
         *(("--format", one, FORMATS) for one in formats or ()),
     ]
@@ -91,6 +95,7 @@ def create_job(
     *,
     model: str,
     preset: str,
+    segment: str = DEFAULT_SEGMENT,
     formats: list[str] | None = None,
     protocol: str | None = None,
     skip_bad_scans: bool = False,
@@ -100,6 +105,7 @@ def create_job(
         "drive_id": drive_id,
         "model": model,
         "preset": preset,
+        "segment": segment,
         "skip_bad_scans": skip_bad_scans,
     }
     if formats:
@@ -145,42 +151,52 @@ def ensure_model(client: Client, model: str) -> str:
     return name
 
 
-def check_log(log: Path) -> None:
-    """Raise DriveLogError when a log is neither a directory nor an archive the service takes."""
+def check_log(log: Path, what_it_is: str = "a drive log") -> None:
+    """Raise DriveLogError when a log, or whatever it is, is neither a directory nor an archive the service takes."""
     if log.is_dir():
         return
     if not log.is_file():
-        what, remedy = "there is no such file or directory", "Name a drive log."
+        what, remedy = "there is no such file or directory", f"Name {what_it_is}."
         raise DriveLogError(Problem("no-log", str(log), what, remedy))
     if not is_archive_name(log):
         what, remedy = "it is no archive by its name", f"Give a directory or a {', '.join(ARCHIVE_SUFFIXES)}."
         raise DriveLogError(Problem("no-archive", str(log), what, remedy))
 
 
-def upload_log(client: Client, log: Path) -> dict[str, Any]:
-    """The drive document of a log that ``check_log`` passed, uploaded unless the service has one of the same bytes."""
+def upload_log(client: Client, log: Path, kind: str = "drive") -> dict[str, Any]:
+    """Upload a log or annotations that ``check_log`` passed, unless the service has some of the same bytes.
+
+    Args:
+        client: the service.
+        log: directory or archive.
+        kind: ``drive`` or ``annotations``.
+
+    Returns:
+        The drive's or the annotations' document.
+    """
     if log.is_dir():
         with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
             archive = Path(scratch) / f"{log.resolve().name}.tar"
             with _bytes_bar("packing") as (_, report):
                 pack_log(log, archive, report)
-            return _upload_archive(client, archive, log.resolve().name)
+            return _upload_archive(client, archive, log.resolve().name, kind)
     name = log.name
     for suffix in sorted(ARCHIVE_SUFFIXES, key=len, reverse=True):
         name = name.removesuffix(suffix)
-    return _upload_archive(client, log, name)
+    return _upload_archive(client, log, name, kind)
 
 
-def _upload_archive(client: Client, archive: Path, name: str) -> dict[str, Any]:
+def _upload_archive(client: Client, archive: Path, name: str, kind: str) -> dict[str, Any]:
     size = archive.stat().st_size
     with _bytes_bar("checksum") as (_, report):
         sha256 = sha256_of(archive, report)
-    for drive in client.get("/drives", sha256=sha256)["items"]:
-        if drive["state"] != "rejected":
-            err.print(f"the service has this log already: {drive['id']}", highlight=False)
-            return dict(drive)
+    folder, called = {"drive": ("/drives", "this log"), "annotations": ("/annotations", "these annotations")}[kind]
+    for known in client.get(folder, sha256=sha256)["items"]:
+        if known.get("state") != "rejected":
+            err.print(f"the service has {called} already: {known['id']}", highlight=False)
+            return dict(known)
     with _bytes_bar("uploading", size) as (advance, _):
-        return client.upload(archive, "drive", sha256, name, advance)
+        return client.upload(archive, kind, sha256, name, advance)
 
 
 @contextmanager

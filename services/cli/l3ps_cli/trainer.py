@@ -13,8 +13,13 @@ from l3ps_cli.errors import BAD_INPUT, fail
 NEEDED = ("l3ps_trainer", "torch", "timm")
 
 
+def missing() -> list[str]:
+    """The packages that training needs and that are not installed here; they are looked for and not imported."""
+    return [name for name in NEEDED if find_spec(name) is None]
+
+
 def hand_over(command: str, arguments: Sequence[str]) -> NoReturn:
     """Replace this process by the trainer's command; without a trainer, end with how to install it."""
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        fail(f"The trainer is not installed here ({', '.join(missing)} missing). Run: make setup-trainer.", BAD_INPUT)
+    if names := missing():
+        fail(f"The trainer is not installed here ({', '.join(names)} missing). Run: make setup-trainer.", BAD_INPUT)
     os.execv(sys.executable, [sys.executable, "-m", "l3ps_trainer", command, *arguments])

@@ -61,9 +61,9 @@ def up(
     ] = None,
     logs: Annotated[bool, typer.Option("--logs", help="Show what the services log.")] = False,
 ) -> None:
-    """Run the service on this machine: Redis, API and worker, all data in one directory. Ctrl-C stops it."""
+    """Run the service on this machine: Redis, API and workers, all data in one directory. Ctrl-C stops it."""
     count = workers or max(1, (os.cpu_count() or 1) // threads)
-    options = StackOptions(data.expanduser(), port, count, threads, token or None)
+    options = StackOptions(data.expanduser(), port, count, threads, token or None, training=True)
     try:
         with stop_on_signals(), clear_errors(), Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack:
             out.print(f"l3ps is up at {stack.url}  (data: {stack.data}, logs: {stack.logs})", highlight=False)
@@ -77,7 +77,7 @@ def up(
     except StopRequested:
         out.print("l3ps has stopped.")
     except ChildDiedError as error:
-        fail(f"{error}. Everything else was stopped too. Its last lines:\n{error.child.last_lines()}", JOB_FAILED)
+        fail(f"{error}. Everything else was stopped too. Its last lines:\n{error.last_lines}", JOB_FAILED)
     except (StackError, TimeoutError) as error:
         fail(str(error), JOB_FAILED)
 

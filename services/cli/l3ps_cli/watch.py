@@ -1,4 +1,4 @@
-"""A job's progress in the terminal: one bar a stage, with what the method is doing just now."""
+"""The progress of a job or training in the terminal: one bar a stage, with what it is doing just now."""
 
 from __future__ import annotations
 
@@ -26,6 +26,30 @@ def wait_for_job(
         console: where the bars go.
         check: called between polls; may raise to give up (the embedded stack's health).
     """
+    return _wait(client, f"/jobs/{job_id}", stages_of, console, check)
+
+
+def wait_for_training(client: Client, training_id: str, console: Console) -> dict[str, Any]:
+    """Show a training's progress and figures until it is over; returns its last document."""
+    return _wait(client, f"/trainings/{training_id}", _stage_of_training, console, lambda: None)
+
+
+def _stage_of_training(training: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    figures = " ".join(f"{name} {value:.3g}" for name, value in training["figures"].items() if _is_number(value))
+    yield training["name"], training["stage"] | {"figures": figures}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _wait(
+    client: Client,
+    path: str,
+    stages: Callable[[dict[str, Any]], Iterator[tuple[str, dict[str, Any]]]],
+    console: Console,
+    check: Callable[[], None],
+) -> dict[str, Any]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
@@ -36,11 +60,11 @@ def wait_for_job(
     with Progress(*columns, console=console) as progress:
         bars: dict[str, TaskID] = {}
         while True:
-            job = client.get(f"/jobs/{job_id}")
-            for label, stage in stages_of(job):
+            document = client.get(path)
+            for label, stage in stages(document):
                 _show(progress, bars, label, stage)
-            if job["state"] in FINAL:
-                return job
+            if document["state"] in FINAL:
+                return document
             check()
             time.sleep(_POLL_SECONDS)
 
@@ -66,7 +90,7 @@ def _show(progress: Progress, bars: dict[str, TaskID], label: str, stage: dict[s
     if stage["cached"]:
         step = "from store"
     elif step == "running":
-        step = f"{stage.get('step') or ''} {_units(stage)}"
+        step = f"{stage.get('step') or ''} {_units(stage)} {stage.get('figures', '')}"
     progress.update(bars[label], completed=stage["fraction"], step=step)
     if stage["state"] in ("done", "failed", "cancelled"):
         progress.stop_task(bars[label])

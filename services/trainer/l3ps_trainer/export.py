@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -19,7 +20,8 @@ from torch import Tensor, nn
 
 from l3ps.errors import ProcessingError
 
-from .backbones import Backbone, OnnxGraph
+from .backbones import Backbone, DinoV2, OnnxGraph
+from .backbones.dinov2 import runtime_attention
 from .commute import convolve_before_enlarging
 from .heads import Heads
 
@@ -100,7 +102,8 @@ def write_graph(network: Network, path: Path) -> None:
         onnx.save(_merged(network, network.backbone), path)
         return
     size = sum(p.numel() * p.element_size() for p in network.parameters())
-    _trace(network, torch.zeros((1, 3, spec.height, spec.width)), spec.name, network.outputs(), path, size)
+    with runtime_attention(network.backbone) if isinstance(network.backbone, DinoV2) else nullcontext():
+        _trace(network, torch.zeros((1, 3, spec.height, spec.width)), spec.name, network.outputs(), path, size)
 
 
 def agreement(network: Network, path: Path, inputs: Sequence[NDArray[np.float32]], threads: int = 2) -> Agreement:

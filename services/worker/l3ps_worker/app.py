@@ -23,12 +23,12 @@ from billiard.exceptions import TimeLimitExceeded, WorkerLostError  # noqa: E402
 from celery import signals  # noqa: E402
 
 from l3ps_platform import workflow  # noqa: E402
-from l3ps_platform.catalog import Catalog, stages  # noqa: E402
+from l3ps_platform.catalog import Catalog, StageName, stages  # noqa: E402
 from l3ps_platform.errors import PlatformError  # noqa: E402
+from l3ps_platform.processes import die_with  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
-from l3ps_worker.processes import die_with  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
 
@@ -59,8 +59,9 @@ def _run(stage_id: str, attempt: int) -> None:
         log.warning("stage not recorded", stage=stage_id, reason=str(error))
 
 
-for _task_name in TASK_NAMES.values():
-    app.task(name=_task_name)(_run)
+for _stage, _task_name in TASK_NAMES.items():
+    _seconds = settings.train_seconds if _stage is StageName.TRAIN else settings.stage_seconds
+    app.task(name=_task_name, time_limit=_seconds)(_run)
 
 
 @signals.setup_logging.connect  # type: ignore[untyped-decorator]
@@ -91,13 +92,18 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
     if not isinstance(exception, WorkerLostError | TimeLimitExceeded) or not args:
         return
     if isinstance(exception, TimeLimitExceeded):
-        reason = f"it ran for more than {settings.stage_seconds:.0f} s and was stopped"
+        reason = f"it ran for more than {_limit(exception):.0f} s and was stopped"
     else:
         reason = "its worker process was killed, most likely for using too much memory"
     log.warning("child lost", stage=args[0], reason=reason)
     retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
     with _briefly() as tx:
         workflow.lease_lost(tx, args[0], retry, owner_prefix=owner_prefix(_main_pid), reason=reason)
+
+
+def _limit(error: TimeLimitExceeded) -> float:
+    """The seconds that were too many."""
+    return float(error.args[0]) if error.args and isinstance(error.args[0], int | float) else settings.stage_seconds
 
 
 @signals.worker_init.connect  # type: ignore[untyped-decorator]

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from l3ps.segment.bundle import ModelBundle
+from l3ps.segment.presets import SegmentPreset
 from l3ps.segment.session import Segmenter
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.objects import ObjectStore, open_store
@@ -53,15 +54,15 @@ class Context:
         self.store: ObjectStore = open_store(settings)
         self.scratch = Scratch(settings.scratch, settings.scratch_bytes)
         self.owner = f"{owner_prefix(main_pid or os.getpid())}{os.getpid()}"
-        self._segmenters: OrderedDict[tuple[str, float], Segmenter] = OrderedDict()
+        self._segmenters: OrderedDict[tuple[str, float, SegmentPreset], Segmenter] = OrderedDict()
 
-    def segmenter(self, sha256: str, bundle: Path, min_area: float) -> Segmenter:
+    def segmenter(self, sha256: str, bundle: Path, min_area: float, look: SegmentPreset) -> Segmenter:
         """A session for the bundle, kept for the next scene."""
-        key = (sha256, min_area)
+        key = (sha256, min_area, look)
         if key not in self._segmenters:
             while len(self._segmenters) >= SESSIONS_KEPT:
                 self._segmenters.popitem(last=False)
-            self._segmenters[key] = Segmenter(ModelBundle.load(bundle), self.settings.threads, min_area)
+            self._segmenters[key] = Segmenter(ModelBundle.load(bundle), self.settings.threads, min_area, look)
         self._segmenters.move_to_end(key)
         return self._segmenters[key]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import structlog
 
 from l3ps.drivelog import Drive, open_drive, unpack, validate, without_bad_scans
-from l3ps.errors import DriveLogError, InputError, Problem
+from l3ps.errors import InputError, Problem
 from l3ps.progress import Progress
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.session import Segmenter
@@ -18,7 +18,7 @@ from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, Json, ModelRow, bundles, drives
 from l3ps_platform.errors import StoreError
 from l3ps_worker.context import Context
-from l3ps_worker.work import Done, download, unpack_limits
+from l3ps_worker.work import Done, check_sha256, download, unpack_limits
 
 log = structlog.get_logger(__name__)
 
@@ -43,7 +43,7 @@ def _ingest_drive(context: Context, row: DriveRow, progress: Progress) -> Done:
 
         problems: Sequence[Problem] = ()
         try:
-            _check_claim(row.sha256, sha256, row.filename)
+            check_sha256(row.sha256, sha256, row.filename)
             with context.scratch.entry(key, make) as root:
                 drive = open_drive(root)
                 problems = validate(drive, progress)
@@ -74,9 +74,8 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
         archive = folder / "model.zip"
         sha256 = download(context, row.object_key, archive, row.size, progress)
         try:
-            _check_claim(row.sha256, sha256, row.filename)
-            bundle = ModelBundle.load(archive)
-            Segmenter(bundle, context.settings.threads)  # onnxruntime reads the graph here
+            check_sha256(row.sha256, sha256, row.filename)
+            info = check_model(archive, context.settings.threads)
         except InputError as error:
             problems = [_without_path(problem, folder, row.filename) for problem in error.problems]
             log.info("model rejected", problems=[str(problem) for problem in problems])
@@ -84,15 +83,22 @@ def _ingest_model(context: Context, row: ModelRow, progress: Progress) -> Done:
                 lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=problems, sha256=sha256),
                 afterwards=lambda: _delete(context, row.object_key),
             )
+    return Done(lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=[], sha256=sha256, info=info))
+
+
+def check_model(archive: Path, threads: int) -> Json:
+    """What the catalog says about a zipped bundle. ModelError for one that cannot be used."""
+    bundle = ModelBundle.load(archive)
+    Segmenter(bundle, threads)  # onnxruntime reads the graph here
     spec = bundle.info.input
-    info: Json = {
+    return {
         "name": bundle.info.name,
         "label_space": bundle.info.label_space,
         "classes": list(bundle.info.classes),
         "input": [spec.height, spec.width],
         "has_boundary": bundle.info.output.boundary is not None,
+        "passes": sorted(bundle.info.passes),
     }
-    return Done(lambda tx, claim, cost: workflow.model_checked(tx, claim, cost, problems=[], sha256=sha256, info=info))
 
 
 def _describe(drive: Drive, progress: Progress) -> tuple[Json, int, int]:
@@ -116,12 +122,6 @@ def _describe(drive: Drive, progress: Progress) -> tuple[Json, int, int]:
         "truth_space": drive.truth_space,
     }
     return info, len(scans), total
-
-
-def _check_claim(claimed: str | None, found: str, filename: str) -> None:
-    if claimed is not None and claimed != found:
-        what = f"its sha256 is {found[:12]}…, the client announced {claimed[:12]}…"
-        raise DriveLogError(Problem("damaged-upload", filename, what, "Upload it again."))
 
 
 def _renamed(problem: Problem, filename: str) -> Problem:

@@ -7,21 +7,29 @@ labels, because the key of a segment stage covers only the code and the settings
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import l3ps
+from l3ps.errors import ProcessingError
 from l3ps.presets import Preset
 from l3ps.refine.cluster import build
+from l3ps.segment.presets import SegmentPreset
+from l3ps_worker.trainer import TRAINER
 
 _ROOT = Path(l3ps.__path__[0])
 _SEGMENTATION = ("segment", "drivelog", "project.py", "geometry.py", "taxonomy.py", "pipeline.py", "labels/types.py")
+_BUNDLE = ("segment", "taxonomy.py")
 _NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
 
 
-def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset, *, skip: bool) -> str:
+def segment_key(
+    drive_sha256: str, model_sha256: str, scene: str, preset: Preset, look: SegmentPreset, *, skip: bool
+) -> str:
     """Key of a scene's primal labels."""
     return _key(
         "segment",
@@ -29,6 +37,7 @@ def segment_key(drive_sha256: str, model_sha256: str, scene: str, preset: Preset
         model=model_sha256,
         scene=scene,
         min_area=preset.min_area,
+        look=look.as_dict(),
         skip=skip,
         code=code_version(_SEGMENTATION),
     )
@@ -50,18 +59,44 @@ def refine_key(
     )
 
 
+def train_key(annotations: list[str], settings: Mapping[str, Any], backbone: str) -> str:
+    """Key prefix of a trained bundle and its checkpoint, whatever the model is called.
+
+    Args:
+        annotations: digests of the archives, those to measure on last.
+        settings: of the training.
+        backbone: digest of the backbone's files.
+    """
+    code = [trainer_version(), code_version(_BUNDLE)]
+    return _key("train", annotations=annotations, settings=dict(settings), backbone=backbone, code=code)
+
+
+@cache
+def trainer_version() -> str:
+    """A digest of the trainer's source, which is looked up and not imported. ProcessingError where there is none."""
+    found = importlib.util.find_spec(TRAINER)
+    if found is None or found.origin is None:
+        raise ProcessingError("this worker has no trainer: install l3ps-trainer beside it, or stop serving queue train")
+    return _digest(Path(found.origin).parent, lambda _: True).hexdigest()
+
+
 @cache
 def code_version(parts: tuple[str, ...] = ()) -> str:
     """A digest of the method's source: the given files and folders of ``l3ps``, or all that decides labels.
 
     All of it covers the build of the clustering too: the package that stands in for it decides ties otherwise.
     """
-    digest = hashlib.sha256()
-    for path in sorted(path for path in _ROOT.rglob("*.py") if _covered(path.relative_to(_ROOT).as_posix(), parts)):
-        digest.update(path.relative_to(_ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    digest = _digest(_ROOT, lambda path: _covered(path, parts))
     if not parts:
         digest.update(build().encode())
     return digest.hexdigest()
+
+
+def _digest(root: Path, covered: Callable[[str], bool]) -> hashlib._Hash:
+    digest = hashlib.sha256()
+    for path in sorted(path for path in root.rglob("*.py") if covered(path.relative_to(root).as_posix())):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest
 
 
 def _covered(path: str, parts: tuple[str, ...]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import structlog
 
@@ -27,15 +27,16 @@ class StageProgress:
     Args:
         context: the worker.
         claim: the stage.
-        steps: names of the steps the stage goes through, in order; each counts the same in the overall fraction.
+        steps: names of the steps the stage goes through, in order, with the share of each in the overall fraction;
+            without shares each counts the same.
 
     Calling it raises :class:`l3ps.errors.Cancelled`, :class:`Stopping` or ``LeaseLost`` when the work is to end.
     """
 
-    def __init__(self, context: Context, claim: workflow.Claim, steps: Sequence[str]) -> None:
+    def __init__(self, context: Context, claim: workflow.Claim, steps: Sequence[str] | Mapping[str, float]) -> None:
         self._context = context
         self._claim = claim
-        self._steps = list(steps)
+        self._shares = dict(steps) if isinstance(steps, Mapping) else dict.fromkeys(steps, 1.0)
         self._written = float("-inf")
         self._fraction = 0.0
 
@@ -47,9 +48,10 @@ class StageProgress:
         if now - self._written < self._context.settings.progress_seconds:
             return
         self._written = now
-        if stage in self._steps:
-            share = self._steps.index(stage) + (done / total if total else 1.0)
-            self._fraction = max(self._fraction, min(share / len(self._steps), 1.0))
+        if stage in self._shares:
+            names, shares = list(self._shares), list(self._shares.values())
+            share = sum(shares[: names.index(stage)]) + self._shares[stage] * (done / total if total else 1.0)
+            self._fraction = max(self._fraction, min(share / sum(shares), 1.0))
         try:
             with self._context.catalog.transaction() as tx:
                 workflow.report(tx, self._claim, stage, done, total, fraction=self._fraction)

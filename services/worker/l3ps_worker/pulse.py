@@ -20,9 +20,9 @@ import structlog
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.errors import PlatformError
+from l3ps_platform.processes import die_with, is_child
 from l3ps_platform.settings import Settings, get_settings
 from l3ps_platform.telemetry import configure_logging
-from l3ps_worker.processes import die_with, is_child
 
 log = structlog.get_logger(__name__)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import structlog
@@ -21,6 +21,9 @@ from l3ps_worker.publish import publish
 from l3ps_worker.refine import STEPS as REFINE_STEPS
 from l3ps_worker.refine import refine
 from l3ps_worker.segment import segment
+from l3ps_worker.train import STEPS as TRAIN_STEPS
+from l3ps_worker.train import train
+from l3ps_worker.trainer import TrainerLost
 from l3ps_worker.work import Done
 
 log = structlog.get_logger(__name__)
@@ -28,13 +31,14 @@ log = structlog.get_logger(__name__)
 Work = Callable[[Context, workflow.Claim, Progress], Done]
 Outcome = Literal["done", "failed", "cancelled", "released", "lost", "not-claimed"]
 
-WORK: dict[StageName, tuple[Work, Sequence[str]]] = {
+WORK: dict[StageName, tuple[Work, Sequence[str] | Mapping[str, float]]] = {
     StageName.INGEST: (ingest, ("fetch", "unpack", "validate", "count")),
     StageName.SEGMENT: (segment, ("segment",)),
     StageName.REFINE: (refine, REFINE_STEPS),
     StageName.PUBLISH: (publish, ("publish",)),
+    StageName.TRAIN: (train, TRAIN_STEPS),
 }
-"""What does each stage, and the steps its progress counts."""
+"""What does each stage, and the steps its progress counts, with their shares where they differ."""
 
 
 def run_stage(context: Context, stage_id: str, attempt: int) -> Outcome:
@@ -54,6 +58,7 @@ def run_stage(context: Context, stage_id: str, attempt: int) -> Outcome:
             log.info("nothing to do for this message")
             return "not-claimed"
         owner = {"job": claim.job_id, "scene": claim.scene_id, "drive": claim.drive_id, "model": claim.model_id}
+        owner["training"] = claim.training_id
         with bound(kind=claim.name.value, **owner):
             try:
                 return _run_claimed(context, claim)
@@ -82,6 +87,8 @@ def _run_claimed(context: Context, claim: workflow.Claim) -> Outcome:
     except (InputError, ProcessingError) as caught:
         # The same input fails the same way: no second try.
         return _failed(context, claim, workflow.error_json(caught), _cost(book, done), retry=False)
+    except TrainerLost as caught:
+        return _failed(context, claim, _error(str(caught)), _cost(book, done), retry=True)
     except Exception as caught:
         log.exception("stage broke")
         reason = f"{type(caught).__name__}: {caught}"
@@ -124,7 +131,7 @@ def _cost(book: CostBook, done: Done | None) -> workflow.Cost:
     peak = max([spent.peak_mb, *(mb for _, mb in steps.values())])
     return workflow.Cost(
         seconds=spent.seconds,
-        cpu_seconds=spent.cpu_seconds,
+        cpu_seconds=spent.cpu_seconds + (done.child_cpu_seconds if done else 0.0),
         peak_mb=peak,
         scans=done.scans if done else 0,
         points=done.points if done else 0,

@@ -26,7 +26,7 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     with opened_scene(context, work, progress) as (_, scene), context.scratch.workdir() as folder:
         with model_file(context, work.model, progress) as bundle:
             assert work.model.sha256 is not None
-            segmenter = context.segmenter(work.model.sha256, bundle, work.preset.min_area)
+            segmenter = context.segmenter(work.model.sha256, bundle, work.preset.min_area, work.look)
         with book.span("segment"):
             labels = primal_labels(scene, segmenter, progress)
         write_labels(folder / "primal.npz", labels)
@@ -38,5 +38,5 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
 def primal_key(work: SceneWork) -> str:
     """Where the scene's primal labels lie."""
     assert work.drive.sha256 is not None and work.model.sha256 is not None
-    base = segment_key(work.drive.sha256, work.model.sha256, work.scene.name, work.preset, skip=work.skip)
-    return f"{base}/primal.npz"
+    inputs = work.drive.sha256, work.model.sha256, work.scene.name
+    return f"{segment_key(*inputs, work.preset, work.look, skip=work.skip)}/primal.npz"

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from l3ps.drivelog import Drive, Scene, UnpackLimits, open_drive, unpack, validate, without_bad_scans
-from l3ps.errors import ProcessingError
+from l3ps.errors import InputError, Problem, ProcessingError
 from l3ps.presets import PRESETS, Preset
 from l3ps.progress import Progress
+from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
 from l3ps_platform.errors import ObjectMissing
@@ -32,6 +33,7 @@ class Done:
         scans, points: how much was processed.
         cached: the output was there already.
         steps: (seconds, peak MB) of the steps inside.
+        child_cpu_seconds: processor time of processes that the stage started.
         afterwards: runs after the commit; what it leaves undone the reconciler does.
     """
 
@@ -40,6 +42,7 @@ class Done:
     points: int = 0
     cached: bool = False
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
+    child_cpu_seconds: float = 0.0
     afterwards: Callable[[], None] = lambda: None
 
 
@@ -59,6 +62,14 @@ class SceneWork:
         if name not in PRESETS:
             raise ProcessingError(f"this worker knows no preset {name!r}; it knows {', '.join(PRESETS)}")
         return PRESETS[name]
+
+    @property
+    def look(self) -> SegmentPreset:
+        """The job's way to look at images; jobs of before there was a choice have none set."""
+        name = self.job.settings.get("segment", DEFAULT_SEGMENT)
+        if name not in SEGMENT_PRESETS:
+            raise ProcessingError(f"this worker knows no segmentation {name!r}; it knows {', '.join(SEGMENT_PRESETS)}")
+        return SEGMENT_PRESETS[name]
 
     @property
     def skip(self) -> bool:
@@ -133,6 +144,19 @@ def download(context: Context, key: str | None, path: Path, size: int, progress:
     except ObjectMissing:
         raise ProcessingError("the uploaded archive is no longer in the store: upload it again") from None
     return digest.hexdigest()
+
+
+def check_sha256(claimed: str | None, found: str, filename: str) -> None:
+    """InputError for an upload that is not what its client announced."""
+    if claimed is not None and claimed != found:
+        what = f"its sha256 is {found[:12]}…, the client announced {claimed[:12]}…"
+        raise InputError(Problem("damaged-upload", filename, what, "Upload it again."))
+
+
+def sha256_of(path: Path) -> str:
+    """Hex sha256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def unpack_limits(settings: Settings) -> UnpackLimits:

@@ -1,7 +1,9 @@
 """The model bundle: ``model.onnx`` and ``model.json`` in a directory or zip.
 
 ``model.json`` tells what the network wants and what its outputs mean; ``about.json`` of the same content is read where
-there is no ``model.json``. Nothing here needs onnxruntime, so a service may check a bundle without carrying it.
+there is no ``model.json``. Further graphs (``passes``) and files with weights lie beside them. Everything is held in
+memory, so that nothing later opens a file that a graph names. Nothing here needs onnxruntime, so a service may look at
+a bundle without carrying it.
 """
 
 from __future__ import annotations
@@ -10,19 +12,23 @@ import hashlib
 import io
 import json
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from l3ps.errors import ModelError, Problem
+from l3ps.segment.external import PLAIN_NAME, external_tensors
+from l3ps.segment.files import MAX_MODEL_BYTES, BundleFiles, FolderFiles, ZipFiles, bundle_error
 from l3ps.taxonomy import NUSCENES16
 
 MAX_JSON_BYTES = 1 << 20
-MAX_MODEL_BYTES = 4 << 30
+MAX_GRAPH_BYTES = (2 << 30) - 1
+"""What a protobuf message can be; larger weights lie in files beside the graph."""
 _DESCRIPTIONS = ("model.json", "about.json")
 
 
@@ -58,6 +64,16 @@ class OutputSpec(BaseModel):
     """Below it a pixel counts as boundary; 0.98 is the published value for averaged tilings."""
 
 
+class PassSpec(BaseModel):
+    """A further graph of the same network, with the same names, for another input size."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    graph: str = Field(pattern=PLAIN_NAME)
+    height: int = Field(gt=0, le=8192)
+    width: int = Field(gt=0, le=8192)
+
+
 class ModelInfo(BaseModel):
     """Content of ``model.json``."""
 
@@ -69,6 +85,8 @@ class ModelInfo(BaseModel):
     output: OutputSpec
     classes: tuple[str, ...] = Field(min_length=1, max_length=1000)
     to_nuscenes: dict[str, int]
+    passes: dict[Annotated[str, Field(pattern=PLAIN_NAME)], PassSpec] = Field(default_factory=dict, max_length=8)
+    """Segmentation preset → the graph that it runs, where that is not ``model.onnx``."""
 
     @model_validator(mode="after")
     def _mapping_complete(self) -> ModelInfo:
@@ -93,12 +111,35 @@ class ModelBundle:
     Attributes:
         info: what ``model.json`` says.
         graph: the serialised ONNX graph.
-        sha256: of graph and description; names the bundle in caches.
+        sha256: of all graphs, their data and the description; names the bundle in caches.
+        graphs: file name → further serialised graphs, those of ``info.passes``.
+        data: file name → content of the files that the graphs take weights from. A session is given these bytes and
+            opens nothing by itself.
     """
 
     info: ModelInfo
     graph: bytes
     sha256: str
+    graphs: Mapping[str, bytes] = field(default_factory=dict)
+    data: Mapping[str, bytes] = field(default_factory=dict)
+
+    def graph_for(self, preset: str) -> tuple[bytes, InputSpec]:
+        """The graph that a segmentation preset runs, and what it is fed.
+
+        ``fast`` and ``paper`` run ``model.onnx`` unless the bundle has a graph of their own.
+
+        Raises:
+            ModelError: when the bundle has no graph for the preset.
+        """
+        if preset in self.info.passes:
+            chosen = self.info.passes[preset]
+            size = {"height": chosen.height, "width": chosen.width}
+            return self.graphs[chosen.graph], self.info.input.model_copy(update=size)
+        if preset in {"fast", "paper"}:
+            return self.graph, self.info.input
+        what = f"it has no graph for the preset '{preset}' (it has {', '.join(['fast', 'paper', *self.info.passes])})"
+        remedy = "Export it with `l3ps train … --balanced HxW`, or choose the preset fast."
+        raise ModelError(Problem("missing-pass", f"model '{self.info.name}'", what, remedy))
 
     @classmethod
     def load(cls, path: Path) -> ModelBundle:
@@ -110,17 +151,19 @@ class ModelBundle:
         path = Path(path)
         try:
             if path.is_dir():
-                members = {p.name: p for p in path.iterdir() if p.is_file()}
-                description, graph = _pick(set(members), str(path))
-                return cls._parse(members[description].read_bytes(), members[graph].read_bytes(), str(path))
+                return cls._read(FolderFiles(path))
             if not path.exists():
-                raise _error("missing-model", str(path), "there is no such file or directory")
+                raise bundle_error("missing-model", str(path), "there is no such file or directory")
             with zipfile.ZipFile(path) as archive:
                 return cls.from_zip(archive, str(path))
         except zipfile.BadZipFile as error:
-            raise _error("not-a-model", str(path), f"it is neither a directory nor a readable zip ({error})") from error
+            raise bundle_error(
+                "not-a-model", str(path), f"it is neither a directory nor a readable zip ({error})"
+            ) from error
         except OSError as error:
-            raise _error("unreadable-model", str(path), f"it cannot be read ({error.strerror or error})") from error
+            raise bundle_error(
+                "unreadable-model", str(path), f"it cannot be read ({error.strerror or error})"
+            ) from error
 
     @classmethod
     def from_bytes(cls, data: bytes, where: str = "upload") -> ModelBundle:
@@ -129,53 +172,69 @@ class ModelBundle:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 return cls.from_zip(archive, where)
         except zipfile.BadZipFile as error:
-            raise _error("not-a-model", where, f"it is not a readable zip ({error})") from error
+            raise bundle_error("not-a-model", where, f"it is not a readable zip ({error})") from error
 
     @classmethod
     def from_zip(cls, archive: zipfile.ZipFile, where: str) -> ModelBundle:
         """Read a bundle from an open zip; members may sit in one top folder."""
-        members = {info.filename.rsplit("/", 1)[-1]: info for info in archive.infolist() if not info.is_dir()}
-        description, graph = _pick(set(members), where)
-        for name, limit in ((description, MAX_JSON_BYTES), (graph, MAX_MODEL_BYTES)):
-            if members[name].file_size > limit:
-                raise _error("model-too-large", f"{where}/{name}", f"it unpacks to {members[name].file_size} bytes")
-        # The header's size is a claim: read one byte past the limit and no further.
-        with archive.open(members[description]) as handle:
-            text = handle.read(MAX_JSON_BYTES + 1)
-        with archive.open(members[graph]) as handle:
-            data = handle.read(members[graph].file_size + 1)
-        return cls._parse(text, data, where)
+        return cls._read(ZipFiles(archive, where))
 
     @classmethod
-    def _parse(cls, text: bytes, graph: bytes, where: str) -> ModelBundle:
-        try:
-            info = ModelInfo.model_validate(json.loads(text))
-        except ValidationError as error:
-            raise ModelError(
-                Problem("bad-model-json", f"{where}/model.json", f"{_path(e['loc'])}: {e['msg']}", "Correct the field.")
-                for e in error.errors()
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise _error("bad-model-json", f"{where}/model.json", f"it is not valid JSON ({error})") from error
-        if not graph:
-            raise _error("empty-model", f"{where}/model.onnx", "it is empty")
+    def _read(cls, files: BundleFiles) -> ModelBundle:
+        where = files.where
+        description = next((name for name in _DESCRIPTIONS if name in files.names), None)
+        if description is None or "model.onnx" not in files.names:
+            raise bundle_error(
+                "incomplete-model", where, f"it holds no {'model.onnx' if description else 'model.json'}"
+            )
+        text = files.read(description, MAX_JSON_BYTES)
+        graph = files.read("model.onnx", MAX_GRAPH_BYTES)
+        info = _parse(text, where)
+        further = sorted({chosen.graph for chosen in info.passes.values()} - {"model.onnx"})
+        graphs = {name: files.read(name, MAX_GRAPH_BYTES, linked=False) for name in further}
+        data: dict[str, bytes] = {}
+        for name, content in {"model.onnx": graph, **graphs}.items():
+            if not content:
+                raise bundle_error("empty-model", f"{where}/{name}", "it is empty")
+            _add_data(data, files, name, content)
         digest = hashlib.sha256(graph)
-        digest.update(info.model_dump_json().encode())
-        return cls(info=info, graph=graph, sha256=digest.hexdigest())
+        digest.update(info.model_dump_json(exclude=None if info.passes else {"passes"}).encode())
+        for name, content in {**graphs, **data}.items():
+            digest.update(f"\0{name}\0{len(content)}\0".encode())
+            digest.update(content)
+        if "model.onnx" in {chosen.graph for chosen in info.passes.values()}:
+            graphs["model.onnx"] = graph
+        return cls(info=info, graph=graph, sha256=digest.hexdigest(), graphs=graphs, data=data)
 
 
-def _pick(names: set[str], where: str) -> tuple[str, str]:
-    description = next((name for name in _DESCRIPTIONS if name in names), None)
-    if description is None or "model.onnx" not in names:
-        lacking = "model.onnx" if description else "model.json"
-        raise _error("incomplete-model", where, f"it holds no {lacking}")
-    return description, "model.onnx"
+def _parse(text: bytes, where: str) -> ModelInfo:
+    try:
+        return ModelInfo.model_validate(json.loads(text))
+    except ValidationError as error:
+        raise ModelError(
+            Problem("bad-model-json", f"{where}/model.json", f"{_path(e['loc'])}: {e['msg']}", "Correct the field.")
+            for e in error.errors()
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise bundle_error("bad-model-json", f"{where}/model.json", f"it is not valid JSON ({error})") from error
+
+
+def _add_data(data: dict[str, bytes], files: BundleFiles, name: str, graph: bytes) -> None:
+    """Read the files that a graph takes weights from, as far as ``data`` lacks them."""
+    place = f"{files.where}/{name}"
+    try:
+        tensors = external_tensors(graph)
+    except ValueError as error:
+        remedy = "External data lies in plain files beside the graph; export it again so, or with the weights inside."
+        raise ModelError(Problem("bad-external-data", place, str(error), remedy)) from error
+    for tensor in tensors:
+        if tensor.location not in data:
+            data[tensor.location] = files.read(tensor.location, MAX_MODEL_BYTES, linked=False)
+        held = len(data[tensor.location])
+        if tensor.offset + tensor.size > held:
+            what = f"tensor '{tensor.name}' ends at byte {tensor.offset + tensor.size} of {tensor.location}, "
+            raise bundle_error("bad-external-data", place, what + f"which has {held}")
 
 
 def _path(location: tuple[int | str, ...]) -> str:
     return ".".join(map(str, location)) or "model.json"
-
-
-def _error(code: str, where: str, what: str) -> ModelError:
-    remedy = "A model bundle is a directory or zip that holds model.onnx and model.json."
-    return ModelError(Problem(code, where, what, remedy))

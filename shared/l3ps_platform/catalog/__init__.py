@@ -1,12 +1,13 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``jobs``, ``stages``, ``figures`` (sums for the metrics). What changes states is in
-:mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
+changes states is in :mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import bundles, drives, figures, jobs, stages, uploads
+from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
 from l3ps_platform.catalog.models import (
+    AnnotationsRow,
     Base,
     DriveRow,
     JobRow,
@@ -15,6 +16,7 @@ from l3ps_platform.catalog.models import (
     SceneRow,
     StageRow,
     StepRow,
+    TrainingRow,
     UploadRow,
 )
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
@@ -31,6 +33,7 @@ from l3ps_platform.catalog.states import (
 
 __all__ = [
     "QUEUE_OF",
+    "AnnotationsRow",
     "Base",
     "Catalog",
     "DriveRow",
@@ -48,13 +51,16 @@ __all__ = [
     "StageRow",
     "StageState",
     "StepRow",
+    "TrainingRow",
     "Transaction",
     "UploadRow",
     "UploadState",
+    "annotation_sets",
     "bundles",
     "drives",
     "figures",
     "jobs",
     "stages",
+    "trainings",
     "uploads",
 ]

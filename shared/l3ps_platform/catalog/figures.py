@@ -9,7 +9,7 @@ from datetime import datetime
 from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
-from l3ps_platform.catalog.models import JobRow, StageRow, StepRow
+from l3ps_platform.catalog.models import JobRow, StageRow, StepRow, TrainingRow
 from l3ps_platform.catalog.states import JobState, QueueName, StageName, StageState
 
 
@@ -80,6 +80,12 @@ def stage_states(session: Session) -> dict[tuple[StageName, StageState], int]:
 def job_states(session: Session) -> dict[JobState, int]:
     """Number of jobs by state, with a zero for states that none is in."""
     query = select(JobRow.state, func.count()).group_by(JobRow.state)
+    return dict.fromkeys(JobState, 0) | {state: int(count) for state, count in session.execute(query)}
+
+
+def training_states(session: Session) -> dict[JobState, int]:
+    """Number of trainings by state, with a zero for states that none is in."""
+    query = select(TrainingRow.state, func.count()).group_by(TrainingRow.state)
     return dict.fromkeys(JobState, 0) | {state: int(count) for state, count in session.execute(query)}
 
 

@@ -6,15 +6,17 @@ Run as ``python -m l3ps_platform.catalog.migrate`` with the service's settings.
 from __future__ import annotations
 
 import fcntl
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, text
+from sqlalchemy import Connection, Engine, event, text
 
 from l3ps_platform.catalog.session import make_engine
 from l3ps_platform.settings import get_settings
@@ -25,6 +27,8 @@ _LOCK = 7_335_401  # any constant: API replicas that start together migrate one 
 def upgrade(url: str) -> None:
     """Create or migrate the catalog at ``url``; does nothing when it is current. Safe to run concurrently."""
     engine = make_engine(url)
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _without_foreign_keys)
     try:
         with _alone(engine), engine.begin() as connection:
             if connection.dialect.name == "postgresql":
@@ -45,6 +49,11 @@ def _alone(engine: Engine) -> Iterator[None]:
     with open(f"{path}.migrating", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+
+
+def _without_foreign_keys(connection: sqlite3.Connection, _record: Any) -> None:
+    # A table that is made anew is dropped first, and the rows that refer to it would go with it.
+    connection.execute("PRAGMA foreign_keys=OFF")
 
 
 def is_current(connection: Connection) -> bool:

@@ -97,7 +97,7 @@ class UploadRow(Base):
     __table_args__ = (Index(None, "state", "expires_at"),)
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    kind: Mapped[str] = mapped_column(String(16))  # drive | model
+    kind: Mapped[str] = mapped_column(String(16))  # drive | model | annotations
     filename: Mapped[str]
     size: Mapped[int]
     sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
@@ -105,7 +105,7 @@ class UploadRow(Base):
     state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
     object_key: Mapped[str]
     s3_upload_id: Mapped[str]
-    result_id: Mapped[str | None] = mapped_column(String(32))  # the drive or model it became
+    result_id: Mapped[str | None] = mapped_column(String(32))  # the drive, model or annotations it became
     created_at: Mapped[datetime]
     expires_at: Mapped[datetime]
 
@@ -152,10 +152,25 @@ class ModelRow(Base):
     created_at: Mapped[datetime]
 
 
+class AnnotationsRow(Base):
+    """An archive of annotated images. Only a training looks into it; ``sha256`` is the client's claim until then."""
+
+    __tablename__ = "annotations"
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    name: Mapped[str]
+    filename: Mapped[str]
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    size: Mapped[int]
+    object_key: Mapped[str | None]  # None once the archive is deleted
+    created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
+
+
 class JobRow(Base):
     """One labelling of one drive with one model.
 
-    ``settings``: ``{"preset", "formats": […], "protocol", "skip_bad_scans"}``.
+    ``settings``: ``{"preset", "segment", "formats": […], "protocol", "skip_bad_scans"}``.
     ``error``: ``{"message", "problems": […]}``. ``quality``: ``{"protocol", "primal": {…}, "refined": {…}}`` with
     ``Quality.as_dict()`` of each, or None where the log has no truth.
     """
@@ -171,6 +186,34 @@ class JobRow(Base):
     cancel_requested: Mapped[bool] = mapped_column(default=False)
     error: Mapped[Json | None]
     quality: Mapped[Json | None]
+    created_at: Mapped[datetime]
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+
+
+class TrainingRow(Base):
+    """One training of a model on annotated images.
+
+    ``name`` is the model's. ``settings``: what the client asked for, ``{"backbone", "recipe", "images", "size", …}``.
+    ``figures``: the latest of each that the trainer told, ``{"loss", "miou" …}``; ``report``: its report, at the end.
+    ``error``: ``{"message", "problems": […]}``. ``log_key`` names the log's object.
+    """
+
+    __tablename__ = "trainings"
+    __table_args__ = (Index(None, "state"), Index(None, "name"))
+
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    name: Mapped[str] = mapped_column(String(200))
+    annotations_id: Mapped[str] = mapped_column(ForeignKey("annotations.id"))
+    validation_id: Mapped[str | None] = mapped_column(ForeignKey("annotations.id"))
+    model_id: Mapped[str | None] = mapped_column(ForeignKey("models.id"))  # the model it became
+    settings: Mapped[Json]
+    state: Mapped[JobState] = mapped_column(default=JobState.QUEUED)
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    figures: Mapped[Json | None]
+    report: Mapped[Json | None]
+    error: Mapped[Json | None]
+    log_key: Mapped[str | None]
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
@@ -195,19 +238,26 @@ class SceneRow(Base):
 class StageRow(Base):
     """One unit of work a worker can own.
 
-    An ingest stage has a drive or a model, a publish stage a job, segment and refine stages a scene and its job.
+    An ingest stage has a drive or a model, a publish stage a job, segment and refine stages a scene and its job, a
+    train stage a training.
     ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
     count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
     """
 
     __tablename__ = "stages"
-    __table_args__ = (Index(None, "state", "lease_until"), Index(None, "job_id"), Index(None, "scene_id"))
+    __table_args__ = (
+        Index(None, "state", "lease_until"),
+        Index(None, "job_id"),
+        Index(None, "scene_id"),
+        Index(None, "training_id"),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     scene_id: Mapped[str | None] = mapped_column(ForeignKey("scenes.id", ondelete="CASCADE"))
     job_id: Mapped[str | None] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"))
     drive_id: Mapped[str | None] = mapped_column(ForeignKey("drives.id"))
     model_id: Mapped[str | None] = mapped_column(ForeignKey("models.id"))
+    training_id: Mapped[str | None] = mapped_column(ForeignKey("trainings.id", ondelete="CASCADE"))
     name: Mapped[StageName]
     queue: Mapped[QueueName]
     state: Mapped[StageState] = mapped_column(default=StageState.WAITING)

@@ -30,6 +30,20 @@ def of_scene(session: Session, scene_id: str) -> list[StageRow]:
     return list(session.scalars(select(StageRow).where(StageRow.scene_id == scene_id).order_by(StageRow.id)))
 
 
+def of_training(session: Session, training_id: str) -> StageRow:
+    """The stage of a training. NotFound."""
+    row = session.scalars(select(StageRow).where(StageRow.training_id == training_id)).one_or_none()
+    if row is None:
+        raise NotFound("training", training_id)
+    return row
+
+
+def of_trainings(session: Session, training_ids: Iterable[str]) -> dict[str, StageRow]:
+    """The stage of each training."""
+    rows = session.scalars(select(StageRow).where(StageRow.training_id.in_(set(training_ids))))
+    return {row.training_id: row for row in rows if row.training_id is not None}
+
+
 def progress(session: Session, job_ids: Iterable[str]) -> dict[str, tuple[float, int]]:
     """For each job how much of its stages is done, the running ones by their fraction, and how many there are."""
     final = StageRow.state.in_([state for state in StageState if state.final])

@@ -32,7 +32,7 @@ class ModelState(StrEnum):
 
 
 class JobState(StrEnum):
-    """A job's life."""
+    """A job's life, and a training's."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -69,13 +69,15 @@ class StageName(StrEnum):
     SEGMENT = "segment"
     REFINE = "refine"
     PUBLISH = "publish"
+    TRAIN = "train"
 
 
 class QueueName(StrEnum):
-    """The two queues: one for networks, one for everything else."""
+    """The queues: one for networks, one for training them (where the trainer is installed), one for everything else."""
 
     SEGMENT = "segment"
     REFINE = "refine"
+    TRAIN = "train"
 
 
 QUEUE_OF = {
@@ -83,5 +85,6 @@ QUEUE_OF = {
     StageName.SEGMENT: QueueName.SEGMENT,
     StageName.REFINE: QueueName.REFINE,
     StageName.PUBLISH: QueueName.REFINE,
+    StageName.TRAIN: QueueName.TRAIN,
 }
 """Which queue a stage runs on."""

@@ -18,7 +18,7 @@ from l3ps_platform.ids import new_id
 def add(
     tx: Transaction,
     *,
-    kind: Literal["drive", "model"],
+    kind: Literal["drive", "model", "annotations"],
     filename: str,
     size: int,
     parts: int,

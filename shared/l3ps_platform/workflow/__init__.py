@@ -1,10 +1,14 @@
-"""The state machine of drives, models, jobs, scenes and stages. Functions take a transaction and change rows.
+"""The state machine of drives, models, jobs, scenes, trainings and stages.
+
+Functions take a transaction and change rows.
 
 accept_drive, accept_model     an upload is complete → ingest
-submit_job, cancel_job         what clients ask for
+submit_job, cancel_job,        what clients ask for
+  submit_training, cancel_training
 claim, prolong, report       a worker takes a stage and says it is alive
 complete, drive_checked,       how it ended, and what follows from that
-  model_checked, fail, cancelled
+  model_checked, training_done,
+  fail, cancelled
 Reconciler, lease_lost         what nobody is left to report
 """
 
@@ -24,6 +28,7 @@ from l3ps_platform.workflow.outcomes import (
 )
 from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
+from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 
 __all__ = [
     "Claim",
@@ -35,6 +40,7 @@ __all__ = [
     "accept_drive",
     "accept_model",
     "cancel_job",
+    "cancel_training",
     "cancelled",
     "check_cancelled",
     "claim",
@@ -44,10 +50,13 @@ __all__ = [
     "fail",
     "lease_lost",
     "model_checked",
+    "note_training",
     "problems_of",
     "prolong",
     "release",
     "release_owned",
     "report",
     "submit_job",
+    "submit_training",
+    "training_done",
 ]

@@ -3,12 +3,13 @@
 The queue may deliver a message twice, late or never; none of that matters here. Every change of a stage names the
 attempt and the owner it believes in and does nothing when the row disagrees.
 
-Rows are locked in one order everywhere: drive, model, job, stage.
+Rows are locked in one order everywhere: drive, model, job or training, stage.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, cast
@@ -16,8 +17,8 @@ from typing import Any, cast
 from sqlalchemy import CursorResult, Update, select, update
 
 from l3ps.errors import Cancelled
-from l3ps_platform.catalog import bundles, drives, jobs, stages
-from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow
+from l3ps_platform.catalog import bundles, drives, jobs, stages, trainings
+from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost, NotFound
@@ -33,7 +34,7 @@ class Claim:
         owner: who holds it.
         name: what to do.
         lease_seconds: how long the lease runs from each sign of life.
-        job_id, scene_id, drive_id, model_id: whom the stage belongs to.
+        job_id, scene_id, drive_id, model_id, training_id: whom the stage belongs to.
     """
 
     stage_id: str
@@ -45,6 +46,7 @@ class Claim:
     scene_id: str | None = None
     drive_id: str | None = None
     model_id: str | None = None
+    training_id: str | None = None
 
 
 def claim(
@@ -58,8 +60,8 @@ def claim(
     stage = tx.session.get(StageRow, stage_id)
     if stage is None:
         return None
-    job = lock_parents(tx, stage)
-    if job is not None and (job.cancel_requested or job.state.final):
+    parent = lock_parents(tx, stage)
+    if parent is not None and (parent.cancel_requested or parent.state.final):
         return None
     lease = {
         "state": StageState.RUNNING,
@@ -81,7 +83,7 @@ def claim(
         ):
             return None
         taken = attempt + 1
-    _mark_parents_running(tx, stage, job)
+    _mark_parents_running(tx, stage, parent)
     return Claim(
         stage_id,
         taken,
@@ -92,6 +94,7 @@ def claim(
         scene_id=stage.scene_id,
         drive_id=stage.drive_id,
         model_id=stage.model_id,
+        training_id=stage.training_id,
     )
 
 
@@ -128,7 +131,7 @@ def report(tx: Transaction, claim: Claim, step: str, done: int, total: int, *, f
 
     Raises:
         LeaseLost: the stage is no longer ours.
-        Cancelled: the job was cancelled.
+        Cancelled: the job or training was cancelled.
     """
     progress = {"progress_step": step[:32], "progress_done": done, "progress_total": total, "fraction": fraction}
     if not changed(tx, update(StageRow).where(*owned(claim)).values(lease_until=_until(tx, claim), **progress)):
@@ -137,11 +140,13 @@ def report(tx: Transaction, claim: Claim, step: str, done: int, total: int, *, f
 
 
 def check_cancelled(tx: Transaction, claim: Claim) -> None:
-    """Raise Cancelled when the claim's job is to stop."""
-    if claim.job_id is not None:
-        query = select(JobRow.cancel_requested).where(JobRow.id == claim.job_id)
-        if tx.session.scalar(query):
-            raise Cancelled(f"job {claim.job_id} was cancelled")
+    """Raise Cancelled when the claim's job or training is to stop."""
+    job = select(JobRow.cancel_requested).where(JobRow.id == claim.job_id)
+    if claim.job_id is not None and tx.session.scalar(job):
+        raise Cancelled(f"job {claim.job_id} was cancelled")
+    training = select(TrainingRow.cancel_requested).where(TrainingRow.id == claim.training_id)
+    if claim.training_id is not None and tx.session.scalar(training):
+        raise Cancelled(f"training {claim.training_id} was cancelled")
 
 
 def owned(claim: Claim) -> tuple[Any, ...]:
@@ -161,28 +166,28 @@ def changed(tx: Transaction, statement: Update) -> bool:
     return result.rowcount > 0
 
 
-def lock_parents(tx: Transaction, stage: StageRow) -> JobRow | None:
-    """Hold the rows that a stage's change of state may touch, always in the same order; its job, if it has one."""
+def lock_parents(tx: Transaction, stage: StageRow) -> JobRow | TrainingRow | None:
+    """Hold the rows that a stage's change of state may touch, always in the same order; its job or training, if any."""
     if stage.drive_id is not None:
         drives.lock(tx.session, stage.drive_id)
     if stage.model_id is not None:
         bundles.lock(tx.session, stage.model_id)
-    if stage.job_id is None:
-        return None
-    try:
-        return jobs.lock(tx.session, stage.job_id)
-    except NotFound:
-        return None
+    with suppress(NotFound):
+        if stage.job_id is not None:
+            return jobs.lock(tx.session, stage.job_id)
+        if stage.training_id is not None:
+            return trainings.lock(tx.session, stage.training_id)
+    return None
 
 
 def _until(tx: Transaction, claim: Claim) -> datetime:
     return tx.now + timedelta(seconds=claim.lease_seconds)
 
 
-def _mark_parents_running(tx: Transaction, stage: StageRow, job: JobRow | None) -> None:
-    if job is not None and job.state is JobState.QUEUED:
-        job.state = JobState.RUNNING
-        job.started_at = tx.now
+def _mark_parents_running(tx: Transaction, stage: StageRow, parent: JobRow | TrainingRow | None) -> None:
+    if parent is not None and parent.state is JobState.QUEUED:
+        parent.state = JobState.RUNNING
+        parent.started_at = tx.now
     if stage.scene_id is not None:
         scene = tx.session.get(SceneRow, stage.scene_id)
         if scene is not None:

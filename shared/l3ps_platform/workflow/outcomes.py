@@ -1,4 +1,4 @@
-"""What a stage's end means for its scene, its job or its drive."""
+"""What a stage's end means for its scene, its job, its training or its drive."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from l3ps_platform.catalog.states import DriveState, ModelState, StageName, Stag
 from l3ps_platform.errors import LeaseLost
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
-from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle_job
+from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ def complete(
     Raises:
         LeaseLost: the stage is no longer ours; nothing was changed.
     """
-    stage = _finish(tx, claim, StageState.DONE, cost=cost, output_key=output_key)
+    stage = finish(tx, claim, StageState.DONE, cost=cost, output_key=output_key)
     job = jobs.lock(tx.session, _must(stage.job_id))
     if stage.name is StageName.PUBLISH:
         job.quality = quality
@@ -93,7 +93,7 @@ def drive_checked(
     info: Json | None = None,
 ) -> None:
     """A drive's ingest is done: it is ready or rejected, and jobs that waited for it begin or fail. LeaseLost."""
-    stage = _finish(tx, claim, StageState.DONE, cost=cost)
+    stage = finish(tx, claim, StageState.DONE, cost=cost)
     drive = drives.lock(tx.session, _must(stage.drive_id))
     drive.state = DriveState.READY if usable else DriveState.REJECTED
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
@@ -112,7 +112,7 @@ def model_checked(
     info: Json | None = None,
 ) -> None:
     """A model's ingest is done: it is rejected if there are problems, else ready. LeaseLost."""
-    stage = _finish(tx, claim, StageState.DONE, cost=cost)
+    stage = finish(tx, claim, StageState.DONE, cost=cost)
     model = bundles.lock(tx.session, _must(stage.model_id))
     model.state = ModelState.REJECTED if problems else ModelState.READY
     model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
@@ -127,41 +127,43 @@ def fail(tx: Transaction, claim: Claim, error: Json, *, retry: Retry | None = No
     A failed scene does not stop the others of its job. LeaseLost when the stage is no longer ours.
     """
     again = retry is not None and claim.attempt < retry.max_attempts
-    stage = _finish(tx, claim, StageState.WAITING if again else StageState.FAILED, cost=cost, error=error)
+    stage = finish(tx, claim, StageState.WAITING if again else StageState.FAILED, cost=cost, error=error)
     failed(tx, stage, retry if again else None)
 
 
 def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
     """The consequences of a failed attempt whose row is already marked; ``retry`` when it is to be tried again."""
-    job = lock_parents(tx, stage)
-    if job is not None and job.cancel_requested:
+    parent = lock_parents(tx, stage)
+    if parent is not None and parent.cancel_requested:
         stage.state = StageState.CANCELLED
         cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
-        settle_job(tx, job)
+        settle(tx, parent)
     elif retry is not None:
         stage.state = StageState.WAITING
         stage.not_before = tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.attempt - 1))
         stage.attempt += 1
         tx.session.flush()
-    elif job is not None:
+    elif parent is not None:
         cancel_rest_of_scene(tx, stage, StageState.FAILED)
-        settle_job(tx, job)
+        settle(tx, parent)
     else:
         _reject_unchecked(tx, stage)
 
 
 def cancelled(tx: Transaction, claim: Claim, cost: Cost | None = None) -> None:
     """The worker saw the cancel flag and stopped. LeaseLost when the stage is no longer ours."""
-    stage = _finish(tx, claim, StageState.CANCELLED, cost=cost)
+    stage = finish(tx, claim, StageState.CANCELLED, cost=cost)
     cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
-    settle_job(tx, jobs.lock(tx.session, _must(stage.job_id)))
+    parent = lock_parents(tx, stage)
+    if parent is not None:
+        settle(tx, parent)
 
 
 def release(tx: Transaction, claim: Claim) -> None:
     """Give a stage back because this worker stops: it is queued again and no attempt is counted. LeaseLost."""
-    stage = _finish(tx, claim, StageState.QUEUED)
-    job = lock_parents(tx, stage)
-    if job is not None and job.cancel_requested:
+    stage = finish(tx, claim, StageState.QUEUED)
+    parent = lock_parents(tx, stage)
+    if parent is not None and parent.cancel_requested:
         failed(tx, stage, None)
     else:
         enqueue(tx, stage)
@@ -200,7 +202,7 @@ def cancel_job(tx: Transaction, job_id: str) -> JobRow:
     return job
 
 
-def _finish(
+def finish(
     tx: Transaction,
     claim: Claim,
     state: StageState,
@@ -209,6 +211,7 @@ def _finish(
     output_key: str | None = None,
     error: Json | None = None,
 ) -> StageRow:
+    """Mark a stage that is the claim's, and note its cost; the consequences are the caller's. LeaseLost."""
     stage = tx.session.get(StageRow, claim.stage_id)
     if stage is None:
         raise LeaseLost(f"stage {claim.stage_id} is gone")

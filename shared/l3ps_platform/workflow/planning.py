@@ -38,6 +38,7 @@ def submit_job(
     drive_id: str,
     model: str,
     preset: str = "best",
+    segment: str = "fast",
     formats: Sequence[str] = ("nuscenes",),
     protocol: str | None = None,
     skip_bad_scans: bool = False,
@@ -49,6 +50,7 @@ def submit_job(
         drive_id: the drive.
         model: the model's name or id.
         preset: name of a preset of the method.
+        segment: name of a preset of the image segmentation.
         formats: label formats to write.
         protocol: evaluation protocol; None: the one that belongs to the log's truth.
         skip_bad_scans: go on with the good scans of a log with some bad ones.
@@ -56,7 +58,7 @@ def submit_job(
     Raises:
         NotFound: no such drive or model.
         DriveLogError: the drive was rejected, or has bad scans and they are not to be skipped.
-        ModelError: the model was rejected.
+        ModelError: the model was rejected, or has no graph for the segmentation asked for.
     """
     drive = drives.lock(tx.session, drive_id)
     if drive.deleted_at is not None:
@@ -68,6 +70,7 @@ def submit_job(
         model_id=bundle.id,
         settings={
             "preset": preset,
+            "segment": segment,
             "formats": list(formats),
             "protocol": protocol,
             "skip_bad_scans": skip_bad_scans,
@@ -160,6 +163,10 @@ def _refusal(drive: DriveRow, model: ModelRow, job: JobRow) -> InputError | None
         return DriveLogError(spoilt)
     if model.state is ModelState.REJECTED:
         return ModelError(problems_of(model.problem))
+    passes = (model.info or {}).get("passes", [])
+    if model.state is ModelState.READY and job.settings.get("segment") == "balanced" and "balanced" not in passes:
+        what, remedy = "it has no graph for the preset 'balanced'", "Choose segment fast, or export one with it."
+        return ModelError(Problem("missing-pass", f"model '{model.name}'", what, remedy))
     info = drive.info or {}
     if info.get("has_truth") and job.settings["protocol"] == "semantickitti" != info.get("truth_space"):
         what = f"the log's truth is in {info.get('truth_space')} classes, which semantickitti cannot score"

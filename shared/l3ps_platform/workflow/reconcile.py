@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import structlog
 from sqlalchemy import select, update
 
-from l3ps_platform.catalog import bundles, drives, uploads
-from l3ps_platform.catalog.models import DriveRow, ModelRow, StageRow
+from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
+from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
 from l3ps_platform.catalog.states import QueueName, StageState, UploadState
 from l3ps_platform.errors import Conflict, PlatformError
@@ -52,7 +52,7 @@ class Reconciler:
     Args:
         catalog: whose sender is ``queue.send``.
         queue: to see which messages are still on their way.
-        store: to drop abandoned uploads and archives of rejected drives.
+        store: to drop abandoned uploads and archives of what was rejected or deleted.
         settings: intervals and limits.
     """
 
@@ -140,7 +140,8 @@ class Reconciler:
 
     def _delete_archives(self) -> int:
         with self._catalog.reading() as session:
-            found: Iterable[DriveRow | ModelRow] = [
+            found: Iterable[AnnotationsRow | DriveRow | ModelRow] = [
+                *annotation_sets.leftover_archives(session),
                 *drives.leftover_archives(session),
                 *bundles.leftover_archives(session),
             ]

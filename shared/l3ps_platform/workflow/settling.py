@@ -1,10 +1,10 @@
-"""Is the job finished, and how did it end?"""
+"""Is the job or the training finished, and how did it end?"""
 
 from __future__ import annotations
 
 from sqlalchemy import func, select, update
 
-from l3ps_platform.catalog.models import JobRow, Json, SceneRow, StageRow
+from l3ps_platform.catalog.models import JobRow, Json, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageName, StageState
 from l3ps_platform.workflow.planning import enqueue
@@ -24,6 +24,14 @@ def cancel_rest_of_scene(tx: Transaction, stage: StageRow, scene_state: StageSta
         .values(state=StageState.CANCELLED, finished_at=tx.now)
     )
     tx.session.flush()
+
+
+def settle(tx: Transaction, parent: JobRow | TrainingRow) -> None:
+    """:func:`settle_job` or :func:`settle_training`."""
+    if isinstance(parent, JobRow):
+        settle_job(tx, parent)
+    else:
+        settle_training(tx, parent)
 
 
 def settle_job(tx: Transaction, job: JobRow) -> None:
@@ -56,9 +64,28 @@ def settle_job(tx: Transaction, job: JobRow) -> None:
         _finish(tx, job, JobState.FAILED)
 
 
-def _finish(tx: Transaction, job: JobRow, state: JobState) -> None:
-    job.state = state
-    job.finished_at = tx.now
+def settle_training(tx: Transaction, training: TrainingRow) -> None:
+    """Finish a training whose stage is final. The caller holds the training's row."""
+    tx.session.flush()
+    query = select(StageRow).where(StageRow.training_id == training.id)
+    stage = tx.session.scalars(query, execution_options={"populate_existing": True}).one()
+    if training.state.final or not stage.state.final:
+        return
+    if stage.state is StageState.FAILED:
+        training.error = stage.error
+    _finish(tx, training, _ENDS[stage.state])
+
+
+_ENDS = {
+    StageState.DONE: JobState.SUCCEEDED,
+    StageState.FAILED: JobState.FAILED,
+    StageState.CANCELLED: JobState.CANCELLED,
+}
+
+
+def _finish(tx: Transaction, parent: JobRow | TrainingRow, state: JobState) -> None:
+    parent.state = state
+    parent.finished_at = tx.now
     tx.session.flush()
 
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from l3ps_cli.main import app
 from l3ps_cli.processes import Processes
-from l3ps_cli.stack import STOP_WORKER, WORKER, Stack, StackOptions, free_port
+from l3ps_cli.stack import QUEUES, STOP_WORKER, TRAINER_QUEUES, WORKER, Stack, StackOptions, free_port
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.objects import ObjectStore, open_store
@@ -27,6 +27,13 @@ from l3ps_platform.settings import Settings
 
 MiB = 1 << 20
 TUNING = {"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"}
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what costs seconds where it would only cost them twice."""
+    twice = [item for item in items if item.get_closest_marker("once") and item.callspec.params["service"] != "servers"]
+    items[:] = [item for item in items if item not in twice]
+    config.hook.pytest_deselected(items=twice)
 
 
 @dataclass
@@ -77,7 +84,11 @@ class Service:
 
     def wait_for_job(self, job_id: str) -> dict:
         """A job once it is over."""
-        return self.wait(f"/v1/jobs/{job_id}", lambda job: job["state"] in ("succeeded", "failed", "cancelled"))
+        return self.wait(f"/v1/jobs/{job_id}", _over)
+
+    def wait_for_training(self, training_id: str) -> dict:
+        """A training once it is over."""
+        return self.wait(f"/v1/trainings/{training_id}", _over)
 
     def objects(self) -> set[str]:
         """Keys of all uploaded archives; a worker may be writing outputs of other tests' jobs meanwhile."""
@@ -98,6 +109,10 @@ class Service:
         return document
 
 
+def _over(document: dict) -> bool:
+    return document["state"] in ("succeeded", "failed", "cancelled")
+
+
 @pytest.fixture(scope="session", params=["embedded", "servers"])
 def service(request, tmp_path_factory) -> Iterator[Service]:
     """The service twice: as ``l3ps up`` runs it, and on PostgreSQL, MinIO and a Redis server."""
@@ -112,7 +127,7 @@ def _embedded(request, data) -> Iterator[Settings]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in TUNING.items():
             patch.setenv(name, value)
-        with Stack(StackOptions(data, port=0)) as stack:
+        with Stack(StackOptions(data, port=0, training=True)) as stack:
             yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]))
 
 
@@ -128,13 +143,13 @@ def _servers(request, data) -> Iterator[Settings]:
         redis_url=redis.removesuffix("/0") + "/1",  # its worker takes every message, other tests' too
         port=free_port(),
     )
-    env = os.environ | TUNING
+    env = os.environ | TUNING | {"L3PS_TRAINING": "1"}
     for name in ("data_dir", "database_url", "objects_url", "redis_url", "port"):
         env[f"L3PS_{name.upper()}"] = str(getattr(settings, name))
     upgrade(settings.catalog_url)
     with Processes(data / "logs") as processes:
         processes.start("api", [sys.executable, "-m", "l3ps_api"], env)
-        worker = [sys.executable, "-m", *WORKER, "-c", "1"]
+        worker = [sys.executable, "-m", *WORKER, "-Q", f"{QUEUES},{TRAINER_QUEUES}", "-c", "1"]
         processes.start("worker", worker, env, stop_plan=STOP_WORKER)
         processes.wait_until(lambda: _ready(settings.api_url), "the API", 60)
         yield settings

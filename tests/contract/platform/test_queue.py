@@ -25,7 +25,7 @@ def test_a_message_carries_a_stage_s_id_and_attempt_and_nothing_else(redis_url: 
 def test_depth_and_pending(redis_url: str) -> None:
     queue = Queue(Settings(redis_url=redis_url))
     queue.send([MESSAGE, StageMessage("stg_2", 1, StageName.SEGMENT, QueueName.SEGMENT)])
-    assert queue.depth() == {QueueName.SEGMENT: 1, QueueName.REFINE: 1}
+    assert queue.depth() == {QueueName.SEGMENT: 1, QueueName.REFINE: 1, QueueName.TRAIN: 0}
     assert queue.pending(QueueName.REFINE) == {("stg_1", 2)}
 
 

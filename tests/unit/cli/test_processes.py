@@ -68,7 +68,7 @@ def test_children_are_stopped_last_started_first(processes, tmp_path):
 def test_a_child_that_ignores_the_request_is_killed(processes, tmp_path):
     deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready'); time.sleep(600)"
     child = start_python(processes, "deaf", deaf, stop_plan=((signal.SIGTERM, 0.2),))
-    first_line(child.log)
+    first_line(processes.log_of(child.name))
     processes.stop()
     assert child.returncode == -signal.SIGKILL
 
@@ -76,16 +76,16 @@ def test_a_child_that_ignores_the_request_is_killed(processes, tmp_path):
 def test_what_a_child_forked_goes_with_it(processes):
     forks = f"import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', {SLEEP!r}]).pid)"
     child = start_python(processes, "forks", forks)
-    grandchild = int(first_line(child.log))
+    grandchild = int(first_line(processes.log_of(child.name)))
     processes.stop()
     assert gone(grandchild)
 
 
 def test_a_child_that_dies_is_reported_with_its_ending_and_log(processes):
-    child = start_python(processes, "short", "print('could not bind'); raise SystemExit(7)")
-    with pytest.raises(ChildDiedError, match=r"short stopped by itself \(exit status 7\).*short\.log"):
+    start_python(processes, "short", "print('could not bind'); raise SystemExit(7)")
+    with pytest.raises(ChildDiedError, match=r"short stopped by itself \(exit status 7\).*short\.log") as caught:
         processes.wait_until(lambda: False, "nothing", 10)
-    assert child.last_lines() == "could not bind"
+    assert caught.value.last_lines == "could not bind"
 
 
 def test_what_is_never_ready_ends_in_a_sentence(processes):

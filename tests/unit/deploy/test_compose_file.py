@@ -61,12 +61,12 @@ def test_ports_are_published_on_loopback_only():
 
 def test_databases_and_workers_have_no_way_out():
     assert COMPOSE["networks"]["backend"]["internal"] is True
-    for name in [*DATABASES, "worker-segment", "worker-refine", "migrate", "bucket"]:
+    for name in [*DATABASES, "worker-segment", "worker-refine", "worker-train", "migrate", "bucket"]:
         assert SERVICES[name]["networks"] == ["backend"], name
 
 
 def test_the_services_start_after_what_they_need():
-    for name in ("api", "worker-segment", "worker-refine"):
+    for name in ("api", "worker-segment", "worker-refine", "worker-train"):
         needs = {needed: how["condition"] for needed, how in SERVICES[name]["depends_on"].items()}
         assert needs["migrate"] == needs["bucket"] == "service_completed_successfully"
         for needed in ("redis", "postgres", "minio"):
@@ -84,7 +84,18 @@ def test_a_worker_listens_to_each_queue():
     queues = [
         SERVICES[name]["command"][SERVICES[name]["command"].index("-Q") + 1] for name in SERVICES if "worker" in name
     ]
-    assert sorted(queues) == ["refine", "segment"]
+    assert sorted(queues) == ["refine", "segment", "train"]
+
+
+def test_torch_comes_only_to_those_who_ask_for_it():
+    """One profile brings the image with the trainer; what everybody starts has no profile."""
+    assert {name: service["profiles"] for name, service in SERVICES.items() if "profiles" in service} == {
+        "worker-train": ["train"]
+    }
+    assert SERVICES["worker-train"]["build"]["target"] == "worker-train"
+    assert SERVICES["api"]["environment"]["L3PS_TRAINING"] == "${L3PS_TRAINING:-0}"
+    assert any(volume.endswith(":/opt/backbones:ro") for volume in SERVICES["worker-train"]["volumes"])
+    assert SERVICES["worker-train"]["environment"]["L3PS_BACKBONES_DIR"] == "/opt/backbones"
 
 
 def test_every_secret_is_demanded_and_no_other():

@@ -77,3 +77,34 @@ def street(tmp_path_factory, graph):
     classes.append({"id": 16, "name": "vegetation"})
     (folder / "classes.json").write_text(json.dumps({"classes": classes}))
     return folder
+
+
+def official_weights(registers=False, side=37, width=24, depth=1):
+    """Random weights in DINOv2's own naming."""
+    make = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=make) * 0.1
+
+    state = {
+        "cls_token": normal(1, 1, width), "mask_token": normal(1, width), "pos_embed": normal(1, side**2 + 1, width),
+        "patch_embed.proj.weight": normal(width, 3, 14, 14), "patch_embed.proj.bias": normal(width),
+        "norm.weight": 1 + normal(width), "norm.bias": normal(width),
+    }  # fmt: skip
+    for block in range(depth):
+        shapes = {
+            "norm1.weight": (width,), "norm1.bias": (width,), "norm2.weight": (width,), "norm2.bias": (width,),
+            "attn.qkv.weight": (3 * width, width), "attn.qkv.bias": (3 * width,), "attn.proj.weight": (width, width),
+            "attn.proj.bias": (width,), "ls1.gamma": (width,), "ls2.gamma": (width,),
+            "mlp.fc1.weight": (4 * width, width), "mlp.fc1.bias": (4 * width,), "mlp.fc2.weight": (width, 4 * width),
+            "mlp.fc2.bias": (width,),
+        }  # fmt: skip
+        state |= {f"blocks.{block}.{name}": normal(*shape) for name, shape in shapes.items()}
+    if registers:
+        state["register_tokens"] = normal(1, 4, width)
+    return state
+
+
+@pytest.fixture(scope="session")
+def official():
+    return official_weights

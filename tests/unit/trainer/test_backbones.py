@@ -14,32 +14,6 @@ SMALL = {"depth": 1, "embed_dim": 24, "num_heads": 2}
 """A DINOv2 of one narrow block."""
 
 
-def official(registers=False, side=37, width=24, depth=1):
-    """Random weights in DINOv2's own naming."""
-    make = torch.Generator().manual_seed(0)
-
-    def normal(*shape):
-        return torch.randn(shape, generator=make) * 0.1
-
-    state = {
-        "cls_token": normal(1, 1, width), "mask_token": normal(1, width), "pos_embed": normal(1, side**2 + 1, width),
-        "patch_embed.proj.weight": normal(width, 3, 14, 14), "patch_embed.proj.bias": normal(width),
-        "norm.weight": 1 + normal(width), "norm.bias": normal(width),
-    }  # fmt: skip
-    for block in range(depth):
-        shapes = {
-            "norm1.weight": (width,), "norm1.bias": (width,), "norm2.weight": (width,), "norm2.bias": (width,),
-            "attn.qkv.weight": (3 * width, width), "attn.qkv.bias": (3 * width,), "attn.proj.weight": (width, width),
-            "attn.proj.bias": (width,), "ls1.gamma": (width,), "ls2.gamma": (width,),
-            "mlp.fc1.weight": (4 * width, width), "mlp.fc1.bias": (4 * width,), "mlp.fc2.weight": (width, 4 * width),
-            "mlp.fc2.bias": (width,),
-        }  # fmt: skip
-        state |= {f"blocks.{block}.{name}": normal(*shape) for name, shape in shapes.items()}
-    if registers:
-        state["register_tokens"] = normal(1, 4, width)
-    return state
-
-
 def by_hand(state, image, heads=2):
     """Patch tokens of a one-block DINOv2, written down from the published description."""
     rows, columns = image.shape[2] // 14, image.shape[3] // 14
@@ -69,7 +43,7 @@ def by_hand(state, image, heads=2):
 
 
 @pytest.mark.parametrize("registers", [False, True])
-def test_official_weights_give_the_published_networks_tokens(registers):
+def test_official_weights_give_the_published_networks_tokens(registers, official):
     state = official(registers)
     name = "dinov2-s-reg" if registers else "dinov2-s"
     backbone = DinoV2(name, state, (42, 70), **SMALL)
@@ -99,7 +73,7 @@ def test_the_square_training_grid_keeps_its_position_embedding():
         (lambda s: s.update(register_tokens=torch.zeros(1, 4, 24)), "have register tokens"),
     ],
 )
-def test_weights_of_another_network_are_refused_with_the_official_address(spoil, told):
+def test_weights_of_another_network_are_refused_with_the_official_address(spoil, told, official):
     state = official()
     spoil(state)
     with pytest.raises(ModelError, match=told) as error:

@@ -6,14 +6,15 @@ from pathlib import Path
 import pytest
 
 from l3ps.presets import PRESETS
+from l3ps.segment.presets import BALANCED, FAST
 from l3ps_worker import keys
 
 BEST = PRESETS["best"]
 
 
 def segment(**changes) -> str:
-    given = {"drive_sha256": "d", "model_sha256": "m", "scene": "s", "preset": BEST, "skip": False} | changes
-    skip = given.pop("skip")
+    given = {"drive_sha256": "d", "model_sha256": "m", "scene": "s", "preset": BEST, "look": FAST} | changes
+    skip = given.pop("skip", False)
     return keys.segment_key(**given, skip=skip)
 
 
@@ -30,6 +31,8 @@ def refine(**changes) -> str:
         {"scene": "x"},
         {"skip": True},
         {"preset": replace(BEST, min_area=0.5)},
+        {"look": BALANCED},
+        {"look": replace(FAST, fusion="cuts")},
     ],
 )
 def test_segment_keys_tell_inputs_apart(change) -> None:

@@ -11,6 +11,7 @@ from l3ps_api.problems import ErrorItem, stored_items
 from l3ps_platform.catalog import DriveRow, DriveState, JobRow, JobState, ModelRow, ModelState, StageState
 
 Preset = Literal["paper", "best", "fast"]
+Segment = Literal["fast", "balanced", "paper"]
 LabelFormat = Literal["nuscenes", "semantickitti"]
 Protocol = Literal["nuscenes", "paper", "semantickitti"]
 
@@ -23,6 +24,11 @@ class JobRequest(BaseModel):
     drive_id: str = Field(max_length=40)
     model: str = Field(max_length=200, description="Name or id of a model.")
     preset: Preset = "best"
+    segment: Segment = Field(
+        default="fast",
+        description="How images are looked at: in one pass, in one of higher resolution where the model has a graph "
+        "for it, or in the published tilings.",
+    )
     formats: Annotated[list[LabelFormat], Field(min_length=1, description="Label formats to write.")] = ["nuscenes"]
     protocol: Protocol | None = Field(
         default=None, description="Protocol of the quality figures; default: the one that belongs to the log's truth."
@@ -54,7 +60,7 @@ class Stage(BaseModel):
     """One unit of work that a worker takes."""
 
     id: str
-    name: str = Field(description="`ingest`, `segment`, `refine` or `publish`.")
+    name: str = Field(description="`ingest`, `segment`, `refine`, `publish` or `train`.")
     state: StageState
     attempt: int
     step: str | None = Field(default=None, description="What the method is doing now.")
@@ -89,6 +95,7 @@ class JobSummary(BaseModel):
     drive: DriveRef
     model: ModelRef
     preset: str
+    segment: str
     formats: list[str]
     protocol: str | None
     skip_bad_scans: bool
@@ -123,6 +130,7 @@ def summary_fields(job: JobRow, drive: DriveRow, model: ModelRow, progress: floa
     error = job.error or {}
     return {
         **{name: job.settings.get(name) for name in ("preset", "formats", "protocol", "skip_bad_scans")},
+        "segment": job.settings.get("segment", "fast"),
         "id": job.id,
         "drive": DriveRef(id=drive.id, name=drive.name, state=drive.state),
         "model": ModelRef(id=model.id, name=model.name, state=model.state),

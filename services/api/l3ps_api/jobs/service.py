@@ -13,7 +13,10 @@ from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
 from l3ps_platform.workflow import cancel_job, submit_job
 
-_STEPS = ("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store")
+_STEPS = (
+    *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
+    *("features", "train", "export", "validate"),
+)
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
 
 
@@ -76,7 +79,7 @@ def _document(session: Session, job: JobRow) -> Job:
     done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
-        return [_stage(row, steps[row.id]) for row in chosen]
+        return [stage_document(row, steps[row.id]) for row in chosen]
 
     scenes = [
         Scene(
@@ -94,7 +97,8 @@ def _document(session: Session, job: JobRow) -> Job:
     return Job(**summary_fields(job, drive, model, _share(job, done, len(planned))), stages=own, scenes=scenes)
 
 
-def _stage(row: StageRow, steps: list[StepRow]) -> Stage:
+def stage_document(row: StageRow, steps: list[StepRow]) -> Stage:
+    """A stage as clients see it."""
     ordered = sorted(steps, key=lambda step: _STEPS.index(step.name) if step.name in _STEPS else len(_STEPS))
     return Stage(
         id=row.id,

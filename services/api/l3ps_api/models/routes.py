@@ -13,7 +13,7 @@ router = APIRouter(prefix="/v1/models", tags=["models"])
 
 @router.get("")
 def list_models(services: ServicesDep, limit: Limit = 50, cursor: Cursor = None) -> ModelPage:
-    """Models, newest first. A new one comes as an upload of kind `model`."""
+    """Models, newest first. A new one comes as an upload of kind `model`, or is trained."""
     return service.page(services, limit, cursor)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, StringConstraints
 
 from l3ps_api.problems import ErrorItem, stored_items
 from l3ps_platform.catalog import ModelRow, ModelState
+
+MODEL_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+ModelName = Annotated[str, StringConstraints(pattern=MODEL_NAME)]
 
 
 class Model(BaseModel):
@@ -21,7 +24,9 @@ class Model(BaseModel):
     sha256: str | None = None
     state: ModelState
     problems: list[ErrorItem] = Field(default_factory=list, description="Why it was rejected.")
-    info: dict[str, Any] | None = Field(default=None, description="Label space, classes and input size, once checked.")
+    info: dict[str, Any] | None = Field(
+        default=None, description="Label space, classes and input size, once checked; the report of one trained here."
+    )
     created_at: datetime
 
     @classmethod

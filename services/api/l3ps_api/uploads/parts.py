@@ -21,4 +21,4 @@ def part_count(size: int, settings: Settings) -> int:
 
 def largest_part(settings: Settings) -> int:
     """The largest part any upload may have."""
-    return part_size(max(settings.max_upload_bytes, settings.max_model_bytes), settings)
+    return part_size(max(settings.max_upload_bytes, settings.max_model_bytes, settings.max_annotations_bytes), settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
+from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
 from l3ps_api.services import ServicesDep
@@ -11,6 +12,7 @@ from l3ps_api.uploads import service
 from l3ps_api.uploads.schemas import Completion, OpenUpload, Upload, UploadRequest
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
+_FOLDERS = {Drive: "drives", Model: "models", Annotations: "annotations"}
 
 
 @router.post("", status_code=201)
@@ -28,11 +30,15 @@ def get_upload(upload_id: str, services: ServicesDep) -> Upload:
 
 
 @router.post("/{upload_id}/complete", status_code=202)
-def complete_upload(upload_id: str, completion: Completion, response: Response, services: ServicesDep) -> Drive | Model:
-    """Join the parts. A file that is no archive is refused and forgotten; any other is checked by a worker."""
+def complete_upload(
+    upload_id: str, completion: Completion, response: Response, services: ServicesDep
+) -> Drive | Model | Annotations:
+    """Join the parts. A file that is no archive is refused and forgotten; any other is checked by a worker.
+
+    Annotations are looked into when a training uses them.
+    """
     result = service.complete(services, upload_id, completion)
-    folder = "drives" if isinstance(result, Drive) else "models"
-    response.headers["Location"] = f"/v1/{folder}/{result.id}"
+    response.headers["Location"] = f"/v1/{_FOLDERS[type(result)]}/{result.id}"
     return result
 
 

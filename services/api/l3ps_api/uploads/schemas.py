@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from l3ps_platform.catalog import UploadState
 
-Kind = Literal["drive", "model"]
+Kind = Literal["drive", "model", "annotations"]
 Name = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")
 ]
@@ -21,7 +21,10 @@ class UploadRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    kind: Kind = Field(description="`drive`: an archive of a drive log; `model`: a zipped model bundle.")
+    kind: Kind = Field(
+        description="`drive`: an archive of a drive log; `model`: a zipped model bundle; `annotations`: an archive of "
+        "annotated images to train from."
+    )
     filename: Name = Field(examples=["2026-11-22-morning.tar"])
     size: int = Field(ge=0, description="Bytes.")
     sha256: Sha256 | None = Field(default=None, description="Of the whole file; may also come at the completion.")
@@ -40,7 +43,7 @@ class Upload(BaseModel):
     filename: str
     size: int
     state: UploadState
-    result_id: str | None = Field(default=None, description="The drive or model it became.")
+    result_id: str | None = Field(default=None, description="The drive, model or annotations it became.")
     created_at: datetime
     expires_at: datetime
 

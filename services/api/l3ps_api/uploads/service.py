@@ -5,14 +5,24 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
-from l3ps_api.models.schemas import Model
+from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
 from l3ps_api.uploads.parts import part_count, part_size
 from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
-from l3ps_platform.catalog import ModelState, Transaction, UploadRow, UploadState, bundles, drives, uploads
+from l3ps_platform.catalog import (
+    ModelState,
+    Transaction,
+    UploadRow,
+    UploadState,
+    annotation_sets,
+    bundles,
+    drives,
+    uploads,
+)
 from l3ps_platform.errors import Conflict, NotFound, UploadError
 from l3ps_platform.ids import new_id
 from l3ps_platform.objects import Part, segment
@@ -21,24 +31,30 @@ from l3ps_platform.workflow import accept_drive, accept_model
 _PRESIGN_SECONDS = 7 * 24 * 3600
 """S3's limit for the life of a presigned URL."""
 
-_ARCHIVE_REMEDY = "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst."
-_MODEL_REMEDY = "Upload a model bundle as .zip that holds model.onnx and model.json."
-_MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_REMEDIES = {
+    "drive": "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst.",
+    "model": "Upload a model bundle as .zip that holds model.onnx and model.json.",
+    "annotations": "Upload annotated images as .zip, .tar, .tar.gz or .tar.zst.",
+}
+_LIMITS = {
+    "drive": ("max_upload_bytes", "Split the log into shorter drives"),
+    "model": ("max_model_bytes", "Export a smaller network"),
+    "annotations": ("max_annotations_bytes", "Choose fewer images"),
+}
+"""The setting that limits a kind of file, and what else can be done about one that is too large."""
 _SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.zst", ".tzst")
 
 
 def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     """Begin a multipart upload and presign its parts; refuses files that are empty or too large."""
     settings = services.settings
-    limit = settings.max_upload_bytes if request.kind == "drive" else settings.max_model_bytes
+    setting, smaller = _LIMITS[request.kind]
+    limit = int(getattr(settings, setting))
     if request.size == 0:
-        raise invalid("size", "the file is empty (0 bytes)", _remedy(request.kind), code="empty-upload")
+        raise invalid("size", "the file is empty (0 bytes)", _REMEDIES[request.kind], code="empty-upload")
     if request.size > limit:
-        what = f"{request.size} bytes are more than the {limit} bytes a {request.kind} may have"
-        remedy = "Split the log into shorter drives" if request.kind == "drive" else "Export a smaller network"
-        raise too_large(
-            "size", what, f"{remedy}, or raise L3PS_MAX_{'UPLOAD' if request.kind == 'drive' else 'MODEL'}_BYTES."
-        )
+        what = f"{request.size} bytes are more than the {limit} bytes that kind {request.kind} may have"
+        raise too_large("size", what, f"{smaller}, or raise L3PS_{setting.upper()}.")
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/{segment(request.filename)}"
     seconds = min(settings.upload_ttl_seconds, _PRESIGN_SECONDS)
@@ -84,10 +100,10 @@ def abort(services: Services, upload_id: str) -> None:
     services.store.abort_multipart(row.object_key, row.s3_upload_id)
 
 
-def complete(services: Services, upload_id: str, completion: Completion) -> Drive | Model:
-    """Join the parts, look at the first bytes, and hand the file to the ingest stage.
+def complete(services: Services, upload_id: str, completion: Completion) -> Drive | Model | Annotations:
+    """Join the parts, look at the first bytes, and hand a drive or model to the ingest stage.
 
-    May be repeated: a client that lost the answer gets the same drive or model again.
+    May be repeated: a client that lost the answer gets the same drive, model or annotations again.
     """
     with services.catalog.reading() as session:
         row = uploads.get(session, upload_id)
@@ -139,7 +155,7 @@ def _look(services: Services, row: UploadRow) -> ApiProblem | None:
     head = services.store.get_bytes(row.object_key, 0, HEAD_BYTES)
     kind = archive_kind(head)
     if kind is None or (row.kind == "model" and kind != "zip"):
-        return invalid(row.filename, describe(head, row.kind), _remedy(row.kind), code="not-an-archive")
+        return invalid(row.filename, describe(head, row.kind), _REMEDIES[row.kind], code="not-an-archive")
     return None
 
 
@@ -151,19 +167,21 @@ def _discard(services: Services, row: UploadRow) -> None:
 
 def _name(row: UploadRow, completion: Completion) -> str:
     name = completion.name or _stem(row.filename)
-    if row.kind == "model" and not _MODEL_NAME.fullmatch(name):
+    if row.kind == "model" and not re.fullmatch(MODEL_NAME, name):
         what = f"{name!r} cannot name a model"
         raise invalid("name", what, "Use up to 100 letters, digits, dots, dashes and underscores.", code="bad-name")
     return name
 
 
 def _accept(tx: Transaction, row: UploadRow, name: str, sha256: str | None) -> tuple[str, bool]:
-    """Make the drive or model; returns its id and whether it keeps the uploaded object."""
+    """Make the drive, model or annotations; returns its id and whether it keeps the uploaded object."""
     file: dict[str, Any] = {
         "filename": row.filename, "size": row.size, "object_key": row.object_key, "sha256": sha256
     }  # fmt: skip
     if row.kind == "drive":
         return accept_drive(tx, name=name, **file).id, True
+    if row.kind == "annotations":
+        return annotation_sets.add(tx, name=name, **file).id, True
     try:
         known = bundles.by_name(tx.session, name)
     except NotFound:
@@ -173,7 +191,7 @@ def _accept(tx: Transaction, row: UploadRow, name: str, sha256: str | None) -> t
     return accept_model(tx, name=name, **file).id, True
 
 
-def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> Drive | Model:
+def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> Drive | Model | Annotations:
     """After a conflict: another request completed this upload meanwhile, or the model's name is taken."""
     with services.catalog.reading() as session:
         now = uploads.get(session, row.id)
@@ -185,10 +203,12 @@ def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> D
     raise conflict("name-taken", "The name is taken", detail, where="name", remedy="Choose another name.") from error
 
 
-def _result(services: Services, row: UploadRow) -> Drive | Model:
+def _result(services: Services, row: UploadRow) -> Drive | Model | Annotations:
     with services.catalog.reading() as session:
         if row.kind == "drive":
             return Drive.of(drives.get(session, row.result_id or ""))
+        if row.kind == "annotations":
+            return Annotations.of(annotation_sets.get(session, row.result_id or ""))
         return Model.of(bundles.get(session, row.result_id or ""))
 
 
@@ -202,7 +222,3 @@ def _stem(filename: str) -> str:
         if filename.lower().endswith(suffix) and len(filename) > len(suffix):
             return filename[: -len(suffix)]
     return filename
-
-
-def _remedy(kind: str) -> str:
-    return _ARCHIVE_REMEDY if kind == "drive" else _MODEL_REMEDY

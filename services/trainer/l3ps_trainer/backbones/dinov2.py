@@ -12,6 +12,7 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from urllib.error import URLError
@@ -101,6 +102,37 @@ class DinoV2(Backbone):
     def at(self, size: tuple[int, int]) -> DinoV2:
         """The same weights for another input, the position embedding resized from the original."""
         return DinoV2(self.name, self._weights, size, **self._architecture)
+
+
+@contextmanager
+def runtime_attention(backbone: DinoV2) -> Iterator[None]:
+    """Within the block, attention is one operator that ONNX Runtime brings along, for export only.
+
+    Written out, a ViT-S/14 at 448×798 stores 80 MB of attention weights in each of its twelve blocks; the runtime's
+    ``com.microsoft.MultiHeadAttention`` never does. That saves a tenth of the time in float32 and a fifth in int8.
+    """
+    modules = [cast(Any, block).attn for block in backbone.vit.blocks]
+    for module in modules:
+        module.forward = partial(_attention, module)
+    try:
+        yield
+    finally:
+        for module in modules:
+            del module.forward
+
+
+def _attention(module: Any, tokens: Tensor, **_: Any) -> Tensor:
+    queries, keys, values = module.qkv(tokens).chunk(3, dim=-1)
+    attended = torch.onnx.ops.symbolic(
+        "com.microsoft::MultiHeadAttention",
+        (queries, keys, values),
+        {"num_heads": module.num_heads, "scale": float(module.scale)},
+        dtype=tokens.dtype,
+        shape=tokens.shape,
+        version=1,
+    )
+    out: Tensor = module.proj(attended)
+    return out
 
 
 def fetch(name: str, file: Path | None) -> dict[str, Tensor]:

@@ -1,0 +1,90 @@
+"""Queries for archives of annotated images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from sqlalchemy import or_, select
+from sqlalchemy.orm import Session
+
+from l3ps_platform.catalog.models import AnnotationsRow, TrainingRow
+from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.states import JobState
+from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.ids import new_id
+
+ACTIVE = (JobState.QUEUED, JobState.RUNNING)
+
+
+def add(
+    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+) -> AnnotationsRow:
+    """A new archive; ``sha256`` as the client claims it."""
+    row = AnnotationsRow(
+        id=new_id("ann"),
+        name=name,
+        filename=filename,
+        sha256=sha256,
+        size=size,
+        object_key=object_key,
+        created_at=tx.now,
+    )
+    tx.session.add(row)
+    tx.session.flush()
+    return row
+
+
+def get(session: Session, id: str) -> AnnotationsRow:
+    """One archive that is not deleted. NotFound."""
+    row = session.get(AnnotationsRow, id)
+    if row is None or row.deleted_at is not None:
+        raise NotFound("annotations", id)
+    return row
+
+
+def lock(session: Session, id: str) -> AnnotationsRow:
+    """One archive that is not deleted, held against concurrent changes until the transaction ends. NotFound."""
+    query = select(AnnotationsRow).where(AnnotationsRow.id == id, AnnotationsRow.deleted_at.is_(None))
+    row = session.scalars(query.with_for_update(), execution_options={"populate_existing": True}).one_or_none()
+    if row is None:
+        raise NotFound("annotations", id)
+    return row
+
+
+def page(
+    session: Session, *, limit: int = 50, before: str | None = None, sha256: str | None = None
+) -> list[AnnotationsRow]:
+    """Archives that are not deleted, newest first, after the cursor ``before`` (the last id of the page before)."""
+    query = select(AnnotationsRow).where(AnnotationsRow.deleted_at.is_(None))
+    if before is not None:
+        query = query.where(AnnotationsRow.id < before)
+    if sha256 is not None:
+        query = query.where(AnnotationsRow.sha256 == sha256)
+    return list(session.scalars(query.order_by(AnnotationsRow.id.desc()).limit(limit)))
+
+
+def many(session: Session, ids: Iterable[str | None]) -> dict[str, AnnotationsRow]:
+    """Archives by id, deleted ones too; ids without a row are left out."""
+    wanted = {id for id in ids if id is not None}
+    return {row.id: row for row in session.scalars(select(AnnotationsRow).where(AnnotationsRow.id.in_(wanted)))}
+
+
+def delete(tx: Transaction, id: str) -> AnnotationsRow:
+    """Hide an archive; models trained on it stay. NotFound, Conflict while a training uses it.
+
+    The reconciler deletes the bytes: :func:`leftover_archives`.
+    """
+    row = lock(tx.session, id)
+    uses = or_(TrainingRow.annotations_id == id, TrainingRow.validation_id == id)
+    user = tx.session.scalar(select(TrainingRow.id).where(uses, TrainingRow.state.in_(ACTIVE)).limit(1))
+    if user is not None:
+        raise Conflict(f"annotations {id} are used by training {user}: cancel it or wait for its end")
+    row.deleted_at = tx.now
+    tx.session.flush()
+    return row
+
+
+def leftover_archives(session: Session, limit: int = 100) -> list[AnnotationsRow]:
+    """Deleted ones whose archive is still in the store."""
+    gone = (AnnotationsRow.deleted_at.is_not(None), AnnotationsRow.object_key.is_not(None))
+    return list(session.scalars(select(AnnotationsRow).where(*gone).limit(limit)))
