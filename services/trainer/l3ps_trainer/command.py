@@ -95,17 +95,26 @@ def _ending(
 
         try:
             yield report, done, partial(_warn, console)
-        except InputError as error:
+        except (InputError, OSError) as error:
+            wrong = error if isinstance(error, InputError) else _unusable(error)
             display.close()
             if events:
-                lines.failed(error)
-            for problem in error.problems:
+                lines.failed(wrong)
+            for problem in wrong.problems:
                 console.print(str(problem), style="red", markup=False, highlight=False, soft_wrap=True)
             raise typer.Exit(BAD_INPUT) from error
         except (Cancelled, ProcessingError) as error:
             display.close()
             console.print(str(error), style="red", markup=False, highlight=False, soft_wrap=True)
             raise typer.Exit(FAILED if stop.signal is None else 128 + stop.signal) from error
+
+
+def _unusable(error: OSError) -> InputError:
+    """A file that cannot be used, as the user's; any other failure of the system is a defect."""
+    if error.filename is None:
+        raise error
+    what = error.strerror or "it cannot be used"
+    return InputError(Problem("bad-file", str(error.filename), what, "Name a place that exists and that you may use."))
 
 
 def _warn(console: Console, problem: Problem) -> None:

@@ -182,6 +182,9 @@ def _merged(network: Network, backbone: OnnxGraph) -> onnx.ModelProto:
         compose.add_prefix(heads, "heads/", rename_inputs=True, rename_outputs=False),
         io_map=[(f"backbone/{backbone.output}", "heads/features")],
     )
+    domains = {o.domain: o.version for o in merged.opset_import}  # merging lists a domain of both twice
+    del merged.opset_import[:]
+    merged.opset_import.extend(onnx.helper.make_opsetid(domain, opset) for domain, opset in domains.items())
     convolve_before_enlarging(merged, f"backbone/{backbone.output}")
     onnx.checker.check_model(merged)
     return merged

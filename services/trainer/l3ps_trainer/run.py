@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import time
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from l3ps.errors import InputError, Problem
 from l3ps.segment.bundle import InputSpec
@@ -97,6 +99,7 @@ def fit(request: Request, known: AnnotationSet, unseen: AnnotationSet | None, re
         report: told how it goes; may raise to stop.
     """
     torch.set_num_threads(request.threads)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS adds up in any order
     torch.use_deterministic_algorithms(True, warn_only=True)  # CUDA has no such way for some enlargements
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     recipe_name, recipe = _recipe(request, device)
@@ -270,6 +273,8 @@ def _quantised(
         candidate.replace(staging / GRAPH)
         if balanced:
             quantise(staging / BALANCED, staging / BALANCED)
+        for weights in staging.glob("*.data"):
+            weights.unlink()  # of the float graphs; in int8 even a ViT-g fits into the graph's own file
     else:
         candidate.unlink()
     figures = {"kept": kept, "miou": round(after, 2), "float_miou": round(before, 2)}
@@ -278,7 +283,7 @@ def _quantised(
 
 def _inputs(annotations: AnnotationSet, spec: InputSpec) -> list[np.ndarray[Any, np.dtype[np.float32]]]:
     few = annotations.subset(spread(len(annotations.images), COMPARED_IMAGES))
-    return [network_input(image.load().rgb, spec) for image in few.images]
+    return [network_input(Image.fromarray(image.load().rgb), spec) for image in few.images]
 
 
 def _name(request: Request) -> str:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from l3ps.segment.bundle import InputSpec
 from l3ps.segment.images import network_input
@@ -77,7 +78,7 @@ def score_graph(
     session, confusion = session_of(graph, threads), Confusion(len(annotations.classes))
     for done, named in enumerate(annotations.images, start=1):
         image = named.load()
-        logits = session.run(["semantic"], {spec.name: network_input(image.rgb, spec)})[0][0]
+        logits = session.run(["semantic"], {spec.name: network_input(Image.fromarray(image.rgb), spec)})[0][0]
         confusion.add(image.semantic, logits)
         report("validate", done, len(annotations.images), miou=confusion.miou())
     return confusion
@@ -90,7 +91,9 @@ def early_figure(
     kept: list[tuple[Annotated, torch.Tensor]] = []
 
     def features(image: Annotated) -> torch.Tensor:
-        found: torch.Tensor = backbone(torch.from_numpy(network_input(image.rgb, backbone.spec)).to(device))
+        found: torch.Tensor = backbone(
+            torch.from_numpy(network_input(Image.fromarray(image.rgb), backbone.spec)).to(device)
+        )
         return found
 
     @torch.no_grad()

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from l3ps.segment.bundle import InputSpec
@@ -105,7 +106,7 @@ class Views:
 
     def tensor(self, view: View) -> Tensor:
         """(1, 3, H, W) network input of a view."""
-        return torch.from_numpy(network_input(view.rgb, self.spec))
+        return torch.from_numpy(network_input(Image.fromarray(view.rgb), self.spec))
 
     def batches(self, start: int, end: int) -> Iterator[Batch]:
         """See :class:`Source`."""

@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from l3ps.errors import ModelError
 from l3ps.segment.bundle import ModelBundle
-from l3ps.segment.session import Segmenter
 from l3ps_trainer import pastel
 from l3ps_trainer.annotations import NUSCENES_AND_SKY
 from l3ps_trainer.backbones import DinoV2
 from l3ps_trainer.command import app
+from l3ps_trainer.export import session_of
 
 SIZE = (42, 70)
 
@@ -71,7 +71,7 @@ def test_both_checkpoints_become_one_graph_with_one_pass_of_the_encoder(files, e
     assert bundle.info.classes == NUSCENES_AND_SKY.names
     assert bundle.info.output.boundary_threshold == 0.98
     noise = torch.randn((1, 3, *SIZE), generator=torch.Generator().manual_seed(3))
-    session = Segmenter(bundle, threads=1)._session
+    session = session_of(out / "model.onnx", threads=1)
     semantic, boundary = session.run(["semantic", "boundary"], {"image": noise.numpy()})
     with torch.no_grad():
         tokens = DinoV2("dinov2-b", encoder, SIZE, depth=1)(noise)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.nn import functional as f
 
 from l3ps.errors import Cancelled
@@ -106,7 +107,7 @@ def test_a_stopped_training_ends_with_the_same_weights_and_knows_the_classes(tmp
     assert all(torch.equal(value, resumed[name]) for name, value in whole.state_dict().items())
     confusion, image = Confusion(len(known.classes)), unseen.images[0].load()
     with torch.no_grad():
-        semantic, _ = whole(backbone(torch.from_numpy(network_input(image.rgb, backbone.spec))))
+        semantic, _ = whole(backbone(torch.from_numpy(network_input(Image.fromarray(image.rgb), backbone.spec))))
     confusion.add(image.semantic, semantic[0, 1:].numpy())
     assert confusion.miou() > 90
     assert {path.name for path in (tmp_path / "two").iterdir()} == {checkpoint.NAME}, "kept pixels are freed"

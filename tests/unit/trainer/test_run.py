@@ -1,6 +1,7 @@
 """From annotated images to a bundle that the product loads: whole runs, stopped, killed and taken up again."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -239,6 +240,27 @@ def test_a_second_graph_serves_the_balanced_preset(street, graph, tmp_path):
     assert described["passes"] == {"balanced": {"graph": "model-balanced.onnx", "height": 64, "width": 128}}
     larger = onnx.load(tmp_path / "out" / "model-balanced.onnx").graph
     assert [d.dim_value for d in larger.output[0].type.tensor_type.shape.dim] == [1, 3, 16, 32]
+
+
+@pytest.mark.parametrize("allowed", [0.5, -1000])
+def test_int8_is_delivered_where_validation_allows_it(street, tmp_path, whole, monkeypatch, allowed):
+    monkeypatch.setattr("l3ps_trainer.run.KEPT_WITHIN", allowed)
+    shutil.copytree(whole[0] / WORK, tmp_path / "out" / WORK)
+    steps = []
+    request = wish(street, tmp_path / "out", validation=street / "unseen", int8=True)
+    report = run(request, lambda step, done, total, **figures: steps.append(step))
+    assert not {"features", "train"} & set(steps), "a finished training is exported anew, not made anew"
+    assert report["int8"]["kept"] == (allowed > 0)
+    assert report["int8"]["float_miou"] == report["validation"]["miou"]
+    assert ModelBundle.load(tmp_path / "out").info.name == "tiny"
+    assert not list((tmp_path / "out").glob("int8*"))
+
+
+def test_a_place_that_cannot_be_written_to_is_told(street, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(app, arguments(street, tmp_path / "file" / "out"))
+    assert result.exit_code == 2
+    assert "Name a place" in result.stderr
 
 
 def test_int8_needs_images_to_prove_itself_on(street, tmp_path):
