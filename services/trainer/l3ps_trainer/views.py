@@ -7,6 +7,7 @@ with exactly the views that it would have seen.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -58,6 +59,10 @@ class Source(Protocol):
 
     is_features: bool
 
+    @property
+    def steps(self) -> int:
+        """How many there are in a whole training."""
+
     def batches(self, start: int, end: int) -> Iterator[Batch]:
         """Batches of the steps from ``start`` up to ``end``."""
 
@@ -80,6 +85,11 @@ class Views:
     ) -> None:
         self.annotations, self.spec, self.recipe, self.sizes, self.seed = annotations, spec, recipe, sizes, seed
         self._load = lru_cache(KEPT_IMAGES)(lambda index: annotations.images[index].load())
+
+    @property
+    def steps(self) -> int:
+        """See :class:`Source`."""
+        return math.ceil(self.recipe.epochs * len(self.annotations.images) / self.recipe.batch)
 
     def seen(self, step: int) -> list[tuple[int, int]]:
         """(epoch, image) of each view of a step; every image once an epoch, in an order of its own."""
@@ -134,18 +144,31 @@ class Pool:
     def __init__(self, views: Views, folder: Path, shape: tuple[int, int, int]) -> None:
         self._views, self._images = views, len(views.annotations.images)
         fitting = POOL_BYTES // (2 * self._images * int(np.prod(shape)))
-        self.each = max(1, min(views.recipe.views or 1, views.recipe.epochs, fitting))
+        self.each = max(1, min(self._wanted(), fitting))
         self._note = folder / "pool.json"
         count = self._images * self.each
-        semantic, boundary = views.sizes
-        self._planes: dict[str, tuple[str, tuple[int, ...]]] = {
+        self._planes = self._plan(count, shape)
+        self._files = {name: folder / f"pool-{name}.raw" for name in self._planes}
+        self._arrays: dict[str, np.memmap[Any, Any]] = {}
+
+    @property
+    def steps(self) -> int:
+        """See :class:`Source`."""
+        return self._views.steps
+
+    def _wanted(self) -> int:
+        """Views of each image."""
+        return min(self._views.recipe.views or 1, self._views.recipe.epochs)
+
+    def _plan(self, count: int, shape: tuple[int, int, int]) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Type and shape of each file."""
+        semantic, boundary = self._views.sizes
+        return {
             "features": ("float16", (count, *shape)),
             "semantic": ("uint8", (count, *semantic)),
             "inside": ("uint8", (count, *(boundary or (1, 1)))),
             "teaches": ("uint8", (count,)),
         }
-        self._files = {name: folder / f"pool-{name}.raw" for name in self._planes}
-        self._arrays: dict[str, np.memmap[Any, Any]] = {}
 
     def fill(self, backbone: Backbone, device: torch.device, report: Reporter) -> None:
         """Compute what is missing; what an earlier run of the same settings left is kept."""
@@ -154,14 +177,18 @@ class Pool:
             view = self._views.view(*divmod(index, self._images))
             with torch.no_grad():
                 features = backbone(self._views.tensor(view).to(device))[0]
-            self._arrays["features"][index] = features.cpu().numpy().astype(np.float16)
-            self._arrays["semantic"][index] = view.semantic
-            if view.inside is not None:
-                self._arrays["inside"][index] = view.inside
-            self._arrays["teaches"][index] = view.teaches_boundary
+            self._keep(index, view, features)
             if (index + 1) % NOTED_EVERY == 0 or index + 1 == count:
                 self._noted(index + 1)
             report("features", index + 1, count)
+
+    def _keep(self, index: int, view: View, features: Tensor) -> None:
+        """Write down what is kept of a view and its (D, h, w) features."""
+        self._arrays["features"][index] = features.cpu().numpy().astype(np.float16)
+        self._arrays["semantic"][index] = view.semantic
+        if view.inside is not None:
+            self._arrays["inside"][index] = view.inside
+        self._arrays["teaches"][index] = view.teaches_boundary
 
     def batches(self, start: int, end: int) -> Iterator[Batch]:
         """See :class:`Source`."""

@@ -118,14 +118,13 @@ def test_a_size_between_patches_names_the_nearest():
         DinoV2("dinov2-s", None, (450, 800), **SMALL)
 
 
-def test_of_several_graphs_the_one_of_the_images_aspect_is_taken(tmp_path, graph):
-    for size in ((32, 64), (48, 64), (96, 128)):
+def test_of_several_graphs_the_finest_that_bends_images_little_is_taken(tmp_path, graph):
+    for size in ((32, 64), (48, 64), (96, 128), (32, 256)):
         graph(tmp_path / f"{size[1]}x{size[0]}.onnx", size)
-    assert OnnxGraph(tmp_path, None, aspect=1.9).spec.width == 64
-    assert OnnxGraph(tmp_path, None, aspect=1.9).spec.height == 32
-    assert OnnxGraph(tmp_path, None, aspect=4 / 3).spec.height == 48
+    taken = [OnnxGraph(tmp_path, None, aspect=aspect).spec for aspect in (4 / 3, 2.0, 2.1, 6.0, 30.0)]
+    assert [(spec.height, spec.width) for spec in taken] == [(96, 128), (96, 128), (32, 64), (32, 256), (32, 256)]
     assert OnnxGraph(tmp_path, (96, 128)).stride == 4
-    with pytest.raises(ModelError, match="There are: 96x128, 32x64, 48x64"):
+    with pytest.raises(ModelError, match="There are: 96x128, 32x256, 32x64, 48x64"):
         OnnxGraph(tmp_path, (64, 64))
 
 

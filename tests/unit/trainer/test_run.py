@@ -31,7 +31,7 @@ def short(monkeypatch):
 
 def wish(street, out, **changes):
     backbone = f"onnx:{street / 'backbone.onnx'}"
-    usual = Request(street / "known", backbone, out, "tiny", classes=street / "classes.json", threads=1)
+    usual = Request(street / "known", backbone, out, "tiny", recipe="cpu", classes=street / "classes.json", threads=1)
     return replace(usual, **changes)
 
 
