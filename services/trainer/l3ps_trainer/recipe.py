@@ -114,7 +114,7 @@ SCRATCH = Recipe(
     hardest=0.5,
     mine_from=0.5,  # mined from the start, a network without pretrained weights learns little
     class_power=0.3,
-    boundary_threshold=0.5,
+    boundary_threshold=0.7,
     augmentation=Augmentation(crop=(0.3, 1.0), boundary_crop=0.0, saturation=0.4, tint=0.07),
 )
 """A small network trained whole; 220 epochs of 30 images are 2,200 steps."""
