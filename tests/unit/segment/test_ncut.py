@@ -117,6 +117,7 @@ def cut_by_pixel(affinity, least):
     done, todo = [], [np.arange(len(affinity))]
     while todo:
         members = todo.pop()
+        members = members[affinity[np.ix_(members, members)].sum(axis=1) > 0]  # a pixel alone is no segment
         if len(members) < least:
             continue
         found = best_cut(affinity[np.ix_(members, members)])
