@@ -138,6 +138,8 @@ def arguments(street, out, *more):
     command = [
         "train",
         street / "known",
+        "--recipe",
+        "cpu",
         "--backbone",
         f"onnx:{street / 'backbone.onnx'}",
         "--out",
