@@ -57,8 +57,13 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
 
-demo-model: setup-dev ## train the demo's model again from simulated images
-	$(RUN) python -m l3ps_trainer.demo_model --out services/cli/l3ps_cli/models/demo
+demo-model: setup-dev ## train the demo's model again, from thirty simulated images
+	rm -rf demo-model
+	$(RUN) l3ps simulate-images --count 30 --seed 1000 --choose-from 90 --out demo-model/train
+	$(RUN) l3ps simulate-images --count 24 --seed 2000 --out demo-model/check
+	$(RUN) l3ps train demo-model/train --backbone scratch --validation demo-model/check --seed 1 --threads 1 \
+	  --name demo-simulated-k30 --out demo-model/bundle
+	cp demo-model/bundle/model.* demo-model/bundle/report.* services/cli/l3ps_cli/models/demo/
 
 clean: ## remove what the targets made here
-	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo bench-train
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train
