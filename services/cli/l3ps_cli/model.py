@@ -25,7 +25,7 @@ def model() -> None:
 )
 def import_pastel(context: typer.Context) -> None:
     """Turn the authors' published checkpoints into a bundle (needs the trainer: make setup-trainer)."""
-    hand_over("import-pastel", context.args)
+    hand_over("model", "import-pastel", arguments=context.args)
 
 
 @app.command()

@@ -12,4 +12,4 @@ CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_optio
 
 def train(context: typer.Context) -> None:
     """Train a model on few annotated images (needs the trainer: make setup-trainer)."""
-    hand_over("train", context.args)
+    hand_over("train", arguments=context.args)

@@ -18,8 +18,8 @@ def missing() -> list[str]:
     return [name for name in NEEDED if find_spec(name) is None]
 
 
-def hand_over(command: str, arguments: Sequence[str]) -> NoReturn:
+def hand_over(*command: str, arguments: Sequence[str]) -> NoReturn:
     """Replace this process by the trainer's command; without a trainer, end with how to install it."""
     if names := missing():
         fail(f"The trainer is not installed here ({', '.join(names)} missing). Run: make setup-trainer.", BAD_INPUT)
-    os.execv(sys.executable, [sys.executable, "-m", "l3ps_trainer", command, *arguments])
+    os.execv(sys.executable, [sys.executable, "-m", "l3ps_trainer", *command, *arguments])

@@ -22,6 +22,10 @@ FAILED, BAD_INPUT = 1, 2
 app = typer.Typer(name="l3ps_trainer", no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 
 
+model = typer.Typer(no_args_is_help=True, help="Make bundles otherwise than by training.")
+app.add_typer(model, name="model")
+
+
 @app.callback()
 def trainer() -> None:
     """Few annotated images in, a fast CPU model out."""
@@ -140,7 +144,7 @@ def _kept_apart(text: str | None) -> Path | float | None:
     return share
 
 
-@app.command("import-pastel")
+@model.command("import-pastel")
 def import_pastel(
     semantic: Annotated[Path, typer.Argument(help="Lightning checkpoint of the semantic head.")],
     boundary: Annotated[Path, typer.Argument(help="Lightning checkpoint of the boundary head.")],
@@ -163,7 +167,7 @@ def import_pastel(
     typer.echo(f"{out}: torch and ONNX Runtime differ by at most {agreed.probability:.1e} in any value", err=True)
 
 
-@app.command("speed-bundle")
+@model.command("speed-bundle")
 def speed_bundle(
     out: Annotated[Path, typer.Option(help="Folder for the bundle.")],
     backbone: Annotated[str, typer.Option(help="A DINOv2, such as dinov2-s.")] = "dinov2-s",

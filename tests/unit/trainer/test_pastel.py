@@ -64,7 +64,7 @@ def one_block(monkeypatch):
 def test_both_checkpoints_become_one_graph_with_one_pass_of_the_encoder(files, encoder, heads, tmp_path):
     out = tmp_path / "bundle"
     result = CliRunner().invoke(
-        app, ["import-pastel", *map(str, files), "--out", str(out), "--size", "42x70", "--threads", "1"]
+        app, ["model", "import-pastel", *map(str, files), "--out", str(out), "--size", "42x70", "--threads", "1"]
     )
     assert result.exit_code == 0, result.stderr
     bundle = ModelBundle.load(out)
