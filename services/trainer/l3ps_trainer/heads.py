@@ -50,7 +50,7 @@ class Dropping(nn.Sequential):
     """1×1 convolutions at the features' own resolution, normalised over the batch, with much dropout between.
 
     With few images the danger is a head that knows them by heart: dropping 40 % of the features and half of what is
-    made of them is worth 1.5 mIoU in cross-validation on 30 images. In the exported graph both are gone.
+    made of them was worth 1.5 mIoU in one fold of cross-validation on 30 images. In the exported graph both are gone.
 
     Args:
         channels: of the features.

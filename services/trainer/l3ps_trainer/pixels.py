@@ -3,7 +3,8 @@
 Pixels of one view resemble each other, so a step that sees two views whole learns little more than one that sees a
 hundred of their pixels. A head of 1×1 convolutions needs no neighbours: from each view a few hundred pixels are kept,
 rare classes more often than their share, each with its feature at the pixel's own place between the map's cells; a step
-mixes pixels of all views of all images. On 30 images that reached in 350 steps what crops of feature maps did not.
+mixes pixels of all views of all images. In one fold of cross-validation on 30 CamVid images (espnetv2-features at
+1024×512, five views) 350 such steps gave 63.5 mIoU, 400 steps of two crops of the feature maps 59.6 in twice the time.
 """
 
 from __future__ import annotations

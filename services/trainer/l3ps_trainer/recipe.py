@@ -100,7 +100,7 @@ FEW_IMAGES = Recipe(
         crop=(0.3, 1.0), boundary_crop=0.4, stretch=1.25, brightness=0.3, contrast=0.25, saturation=0.4, tint=0.06
     ),
 )
-"""Pixels of many views through heads that forget half of what they see; chosen by cross-validation on 30 images."""
+"""Pixels of many views through heads that forget half of what they see; chosen by cross-validation inside 30 images."""
 
 SCRATCH = Recipe(
     heads="linear",
