@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -14,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, Problem
 from ..progress import Progress, silent
 from ..taxonomy import INSTANCE_FACTOR
 from . import boxes, lidar
 from .camera import RIG, Mount, Picture, Renderer
 from .nuscenes_tables import VERSION, Tables
+from .output import check_arguments, whole
 from .street import Surface
 from .traffic import build_world
 from .world import World
@@ -67,10 +66,8 @@ def simulate_drive(
     Raises:
         InputError: an argument is out of range or ``out`` is in use.
     """
-    _check(out, scenes, scans, seed, width)
-    staging = out.with_name(out.name + ".part")
-    shutil.rmtree(staging, ignore_errors=True)
-    try:
+    check_arguments(out, width, (("scenes", scenes, 1), ("scans", scans, 1), ("seed", seed, 0)))
+    with whole(out) as staging:
         writer = _Writer(staging, seed, (width, width * 9 // 16), image_truth)
         with ThreadPoolExecutor(max_workers=threads) as pool:
             try:
@@ -81,12 +78,6 @@ def simulate_drive(
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
         writer.tables.write(staging / VERSION)
-        if out.exists():
-            out.rmdir()
-        staging.rename(out)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
 
 
 def annotated_images(count: int, seed: int, width: int = WIDTH) -> Iterator[Picture]:
@@ -101,22 +92,6 @@ def annotated_images(count: int, seed: int, width: int = WIDTH) -> Iterator[Pict
         rng = np.random.default_rng([seed, i, 1])
         world = build_world(rng, 10.0)
         yield Renderer(world).picture(RIG[i % len(RIG)], float(rng.uniform(0, 10)), (width, width * 9 // 16), rng)
-
-
-def _check(out: Path, scenes: int, scans: int, seed: int, width: int) -> None:
-    problems = [
-        Problem("out-of-range", name, f"{value} is too small; at least {least} is needed", f"Ask for {least} or more")
-        for name, value, least in (("scenes", scenes, 1), ("scans", scans, 1), ("seed", seed, 0), ("width", width, 64))
-        if value < least
-    ]
-    if width % 16:
-        problems.append(
-            Problem("out-of-range", "width", f"{width} is not a multiple of 16", "Ask for a multiple of 16")
-        )
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        problems.append(Problem("output-in-use", str(out), "it exists and is not empty", "Name a new directory"))
-    if problems:
-        raise InputError(problems)
 
 
 class _Writer:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, Problem
 from ..progress import Progress, silent
 from ..taxonomy import NUSCENES16, VOID
 from .camera import RIG, SKY, Picture
 from .drive import WIDTH, annotated_images
+from .output import check_arguments, whole
+
+_KINDS = ("images", "semantic", "instance")
 
 
 def simulate_images(
@@ -44,28 +46,26 @@ def simulate_images(
         InputError: an argument is out of range or ``out`` is in use.
     """
     drawn = count if choose_from is None else choose_from
-    _check(out, count, seed, drawn, width)
-    staging = out.with_name(out.name + ".part")
-    shutil.rmtree(staging, ignore_errors=True)
-    try:
-        for folder in ("images", "semantic", "instance"):
-            (staging / folder).mkdir(parents=True)
-        pictures = []
-        for done, picture in enumerate(annotated_images(drawn, seed, width), start=1):
-            pictures.append(picture)
-            progress("simulate", done, drawn)
-        for i in worth_annotating([picture.semantic for picture in pictures], count):
-            _write(staging, f"{i:04d}_{RIG[i % len(RIG)].channel}", pictures[i])
+    least = (("count", count, 1), ("seed", seed, 0), ("choose-from", drawn, max(count, 1)))
+    check_arguments(out, width, least)
+    with whole(out) as staging:
+        for folder in _KINDS:
+            (staging / folder).mkdir()
+
+        def written() -> Iterator[NDArray[np.uint8]]:  # one picture in memory at a time
+            for done, picture in enumerate(annotated_images(drawn, seed, width), start=1):
+                _write(staging, _stem(done - 1), picture)
+                progress("simulate", done, drawn)
+                yield picture.semantic
+
+        kept = worth_annotating(written(), count)
+        for i in set(range(drawn)).difference(kept):
+            for kind in _KINDS:
+                (staging / kind / f"{_stem(i)}.png").unlink()
         (staging / "classes.json").write_text(json.dumps(_classes(), indent=1) + "\n")
-        if out.exists():
-            out.rmdir()
-        staging.rename(out)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
 
 
-def worth_annotating(semantic: Sequence[NDArray[np.uint8]], count: int) -> list[int]:
+def worth_annotating(semantic: Iterable[NDArray[np.uint8]], count: int) -> list[int]:
     """The pictures an annotator would choose: again and again the one that adds most of what is still scarce.
 
     Args:
@@ -86,12 +86,13 @@ def worth_annotating(semantic: Sequence[NDArray[np.uint8]], count: int) -> list[
     return sorted(chosen)
 
 
+def _stem(index: int) -> str:
+    return f"{index:04d}_{RIG[index % len(RIG)].channel}"
+
+
 def _write(folder: Path, stem: str, picture: Picture) -> None:
-    for kind, array in (
-        ("images", picture.rgb[..., ::-1]),
-        ("semantic", picture.semantic),
-        ("instance", picture.instance.astype(np.uint16)),
-    ):
+    planes: tuple[NDArray[Any], ...] = (picture.rgb[..., ::-1], picture.semantic, picture.instance.astype(np.uint16))
+    for kind, array in zip(_KINDS, planes, strict=True):
         _, png = cv2.imencode(".png", array)
         (folder / kind / f"{stem}.png").write_bytes(png.tobytes())
 
@@ -100,19 +101,3 @@ def _classes() -> dict[str, object]:
     names = {i: name for i, name in enumerate(NUSCENES16.classes) if i != VOID}
     entries = [{"id": i, "name": name, "nuscenes": name} for i, name in names.items()]
     return {"classes": [*entries, {"id": SKY, "name": "sky", "nuscenes": "void"}], "void": [VOID]}
-
-
-def _check(out: Path, count: int, seed: int, drawn: int, width: int) -> None:
-    least = (("count", count, 1), ("seed", seed, 0), ("choose-from", drawn, max(count, 1)), ("width", width, 64))
-    problems = [
-        Problem("out-of-range", name, f"{value} is too small; at least {lowest} is needed", f"Ask for {lowest} or more")
-        for name, value, lowest in least
-        if value < lowest
-    ]
-    if width % 16:
-        what = f"{width} is not a multiple of 16"
-        problems.append(Problem("out-of-range", "width", what, "Ask for a multiple of 16"))
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        problems.append(Problem("output-in-use", str(out), "it exists and is not empty", "Name a new directory"))
-    if problems:
-        raise InputError(problems)
