@@ -32,7 +32,7 @@ servers: setup-dev
 setup: $(UV)
 	$(UV) sync --frozen --inexact --no-dev --package l3ps-cli --package l3ps-api --package l3ps-worker
 
-setup-trainer: setup ## what `l3ps train` needs: torch, about 3 GB
+setup-trainer: setup ## what `l3ps train` needs: torch, 6 GB on disk
 	$(UV) sync --frozen --inexact --no-dev --package l3ps-trainer
 
 setup-dev: $(UV)

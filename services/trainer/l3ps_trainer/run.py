@@ -24,6 +24,7 @@ from . import report as reports
 from .annotations import AnnotationSet, Format, opened_annotations, spread
 from .backbones import Backbone, open_backbone
 from .bundle import BALANCED, describe, write_description
+from .checks import check_apart, check_classes, check_name, check_out, fingerprints
 from .export import Network, agreement, write_graph
 from .heads import HEADS
 from .quantise import KEPT_WITHIN, quantise
@@ -98,19 +99,25 @@ def fit(request: Request, known: AnnotationSet, unseen: AnnotationSet | None, re
         unseen: images to score on, of the same classes.
         report: told how it goes; may raise to stop.
     """
+    check_name(_name(request))
+    work = _work_folder(request)
+    check_classes(known)
+    seen = fingerprints(known)
+    check_apart(seen, [] if unseen is None else fingerprints(unseen))
     torch.set_num_threads(request.threads)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS adds up in any order
     torch.use_deterministic_algorithms(True, warn_only=True)  # CUDA has no such way for some enlargements
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     recipe_name, recipe = _recipe(request, device)
     backbone = _backbone(request, recipe, known).to(device)
+    if request.balanced is not None:
+        backbone.check(request.balanced, "--balanced")
     torch.manual_seed(request.seed)
     heads = HEADS[recipe.heads](
         backbone.channels, len(known.classes), boundary=known.has_instances, stride=backbone.stride
     ).to(device)
-    work = _work_folder(request)
     course = train(
-        backbone, heads, known, recipe, work, _settings(request, recipe, backbone, known),
+        backbone, heads, known, recipe, work, _settings(request, recipe, backbone, known, seen),
         seed=request.seed, device=device, report=report,
         score=early_figure(backbone, heads, unseen, device) if unseen else None,
     )  # fmt: skip
@@ -198,13 +205,16 @@ def _backbone(request: Request, recipe: Recipe, known: AnnotationSet) -> Backbon
 
 def _work_folder(request: Request) -> Path:
     work = request.out / WORK
+    check_out(request.out, work)
     if request.fresh and work.exists():
         shutil.rmtree(work)
     work.mkdir(parents=True, exist_ok=True)
     return work
 
 
-def _settings(request: Request, recipe: Recipe, backbone: Backbone, known: AnnotationSet) -> dict[str, Any]:
+def _settings(
+    request: Request, recipe: Recipe, backbone: Backbone, known: AnnotationSet, seen: list[str]
+) -> dict[str, Any]:
     """Everything that decides the weights, for the checkpoint."""
     return {
         "backbone": backbone.name,
@@ -213,8 +223,7 @@ def _settings(request: Request, recipe: Recipe, backbone: Backbone, known: Annot
         "recipe": asdict(recipe),
         "seed": request.seed,
         "classes": known.classes.names,
-        "images": [image.name for image in known.images],
-        "pixels": known.counts().tolist(),
+        "images": seen,
         "instances": known.has_instances,
     }
 

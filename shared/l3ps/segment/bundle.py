@@ -26,6 +26,8 @@ from l3ps.segment.external import PLAIN_NAME, external_tensors
 from l3ps.segment.files import MAX_MODEL_BYTES, BundleFiles, FolderFiles, ZipFiles, bundle_error
 from l3ps.taxonomy import NUSCENES16
 
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
+"""Of a model's name."""
 MAX_JSON_BYTES = 1 << 20
 MAX_GRAPH_BYTES = (2 << 30) - 1
 """What a protobuf message can be; larger weights lie in files beside the graph."""
@@ -79,7 +81,7 @@ class ModelInfo(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    name: str = Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: str = Field(min_length=1, max_length=100, pattern=NAME_PATTERN)
     label_space: Literal["nuscenes"] = "nuscenes"
     input: InputSpec
     output: OutputSpec

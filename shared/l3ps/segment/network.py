@@ -62,11 +62,16 @@ class Network:
             (C, h, w) float32 logits and (h', w') float32 probability of lying inside an object, None where the bundle
             has no boundary head.
         """
-        outputs = self.session.run(self._names, {self._bundle.info.input.name: planes}, options)
+        try:
+            outputs = self.session.run(self._names, {self._bundle.info.input.name: planes}, options)
+        except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
+            raise _error(self._bundle, f"it cannot run one image ({_first_line(error)})") from error
         logits = outputs[0][0]
         classes = len(self._bundle.info.classes)
         if len(logits) != classes:
             raise _error(self._bundle, f"the output has {len(logits)} classes, model.json names {classes}")
+        if not np.isfinite(logits).all():
+            raise _error(self._bundle, f"output '{self._names[0]}' has values that are not finite")
         return logits, outputs[1][0, 0] if len(outputs) > 1 else None
 
     def _check_signature(self) -> None:

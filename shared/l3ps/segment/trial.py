@@ -88,7 +88,6 @@ def _passed(bundle: Any, preset: str, threads: int) -> dict[str, Any]:
     import numpy as np  # noqa: PLC0415
 
     from l3ps.errors import ModelError, Problem  # noqa: PLC0415
-    from l3ps.segment.graphs import first_line  # noqa: PLC0415
     from l3ps.segment.network import Network  # noqa: PLC0415
 
     network = Network(bundle, preset, threads)
@@ -99,13 +98,7 @@ def _passed(bundle: Any, preset: str, threads: int) -> dict[str, Any]:
     output, where = bundle.info.output, f"model '{bundle.info.name}'"
     remedy = "Export the model again, or correct model.json."
     start = time.perf_counter()
-    try:
-        logits, inside = network.run(planes.astype(np.float32))
-    except ModelError:
-        raise
-    except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
-        what = f"it cannot run one image ({first_line(error)})"
-        raise ModelError(Problem("model-failed-trial", where, what, remedy)) from error
+    logits, inside = network.run(planes.astype(np.float32))
     seconds = time.perf_counter() - start
     shapes = {output.semantic: np.asarray(logits)}
     if output.boundary:

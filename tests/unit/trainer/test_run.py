@@ -223,9 +223,9 @@ def test_a_share_of_the_images_is_kept_apart(street, tmp_path):
 def test_a_small_network_is_trained_whole_from_scratch(street, tmp_path, monkeypatch):
     recipe = replace(RECIPES["scratch"], epochs=2, size=(32, 64), view_size=(32, 48))
     monkeypatch.setitem(RECIPES, "scratch", recipe)
-    report = run(wish(street, tmp_path / "one", backbone="scratch"), silent)
+    report = run(wish(street, tmp_path / "one", backbone="scratch", recipe="scratch"), silent)
     with pytest.raises(Cancelled):
-        run(wish(street, tmp_path / "other", backbone="scratch"), before_export)
+        run(wish(street, tmp_path / "other", backbone="scratch", recipe="scratch"), before_export)
     assert same(weights(tmp_path / "one"), weights(tmp_path / "other"))
     assert report["agreement"]["equal"] == 1
     assert any("running_mean" in name for name in weights(tmp_path / "one")), "the backbone is in the checkpoint"
@@ -236,7 +236,7 @@ def test_a_second_graph_serves_the_balanced_preset(street, graph, tmp_path):
     for size in ((32, 64), (64, 128)):
         graph(tmp_path / "graphs" / f"{size[0]}.onnx", size)
     backbone = f"onnx:{tmp_path / 'graphs'}"
-    run(wish(street, tmp_path / "out", backbone=backbone, balanced=(64, 128), epochs=1), silent)
+    run(wish(street, tmp_path / "out", backbone=backbone, size=(32, 64), balanced=(64, 128), epochs=1), silent)
     described = json.loads((tmp_path / "out" / "model.json").read_text())
     assert described["input"]["height"] == 32
     assert described["passes"] == {"balanced": {"graph": "model-balanced.onnx", "height": 64, "width": 128}}

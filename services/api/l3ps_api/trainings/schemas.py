@@ -13,6 +13,8 @@ from l3ps_api.problems import ErrorItem, stored_items
 from l3ps_platform.catalog import AnnotationsRow, JobState, ModelRow, TrainingRow
 
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
+PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
+"""Control characters are nobody's name: PostgreSQL refuses some, and terminals obey others."""
 Side = Annotated[int, Field(ge=32, le=4096)]
 AnnotationFormat = Literal["auto", "plain", "cityscapes", "coco", "nuimages"]
 
@@ -22,7 +24,7 @@ class AnnotatedClass(BaseModel):
 
     id: int | str | None = Field(default=None, description="Number or name in the annotations; default: the category.")
     category: str | None = Field(default=None, description="The same, of formats that name them; default: the name.")
-    name: str = Field(min_length=1, max_length=100)
+    name: str = Field(min_length=1, max_length=100, pattern=PRINTABLE)
     nuscenes: str | int | None = Field(
         default=None,
         description="Class of Panoptic nuScenes that it counts as, by name or number, `void` for none; may be left out "

@@ -54,6 +54,18 @@ class Backbone(nn.Module, ABC):
             InputError: the backbone has no such size.
         """
 
+    @abstractmethod
+    def check(self, size: tuple[int, int], option: str = "--size") -> None:
+        """Refuse an input that :meth:`at` cannot serve.
+
+        Args:
+            size: (height, width).
+            option: that names it.
+
+        Raises:
+            InputError: the backbone has no such size.
+        """
+
 
 def input_spec(size: tuple[int, int]) -> InputSpec:
     """The input of a network trained with ImageNet's mean and deviation.

@@ -99,6 +99,10 @@ class DinoV2(Backbone):
         rows, columns = self.spec.height // PATCH, self.spec.width // PATCH
         return tokens.transpose(1, 2).reshape(len(images), self.channels, rows, columns)
 
+    def check(self, size: tuple[int, int], option: str = "--size") -> None:
+        """Refuse what is no multiple of 14."""
+        _check_size(size, option)
+
     def at(self, size: tuple[int, int]) -> DinoV2:
         """The same weights for another input, the position embedding resized from the original."""
         return DinoV2(self.name, self._weights, size, **self._architecture)
@@ -169,7 +173,7 @@ def read_state(file: Path) -> dict[str, Tensor]:
         state = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise _wrong(file, "there is no such file") from error
-    except (OSError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # what the bytes of any file make of an unpickler
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise _wrong(file, f"it cannot be read as a torch state dict ({first[:160]})") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
@@ -245,11 +249,11 @@ def _impatient() -> Iterator[None]:
         socket.setdefaulttimeout(before)
 
 
-def _check_size(size: tuple[int, int]) -> None:
+def _check_size(size: tuple[int, int], option: str = "--size") -> None:
     if size[0] % PATCH or size[1] % PATCH:
         near = "x".join(str(max(1, round(s / PATCH)) * PATCH) for s in size)
         what = f"DINOv2 sees patches of {PATCH} pixels, and {size[0]}x{size[1]} is no multiple of it"
-        raise ModelError(Problem("bad-size", "--size", what, f"Take {near}."))
+        raise ModelError(Problem("bad-size", option, what, f"Take {near}."))
 
 
 def _misfit(variant: Variant, what: str) -> ModelError:

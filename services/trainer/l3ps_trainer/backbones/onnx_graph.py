@@ -67,11 +67,28 @@ class OnnxGraph(Backbone):
             self._session = onnxruntime.InferenceSession(str(chosen.path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
             raise _wrong(chosen.path, f"onnxruntime cannot load it ({str(error).splitlines()[0][:160]})") from error
+        self._try(chosen)
+
+    def _try(self, graph: _Graph) -> None:
+        """Refuse a graph whose features are not those that it declares."""
+        grey = np.full((1, 3, *graph.size), 0.1, dtype=np.float32)
+        try:
+            (features,) = self._session.run([graph.output], {graph.image: grey})
+        except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
+            raise _wrong(graph.path, f"it cannot be run ({str(error).splitlines()[0][:160]})") from error
+        if features.dtype != np.float32 or features.shape[:2] != (1, graph.channels) or features.ndim != 4:
+            raise _wrong(graph.path, f"it returns {features.dtype} {list(features.shape)} and declares otherwise")
+        if not np.isfinite(features).all():
+            raise _wrong(graph.path, "it returns numbers that are not finite for a grey image")
 
     def forward(self, images: Tensor) -> Tensor:
         single = images.detach().cpu().numpy()
         maps = [self._session.run([self.output], {self.spec.name: image[None]})[0] for image in single]
         return torch.from_numpy(np.concatenate(maps)).to(images.device)
+
+    def check(self, size: tuple[int, int], option: str = "--size") -> None:
+        """Refuse an input of which there is no graph."""
+        _chosen(_graphs(self._path), size, 1.0, option)
 
     def at(self, size: tuple[int, int]) -> OnnxGraph:
         """The graph of the same folder that has this input."""
@@ -110,7 +127,7 @@ def _read(file: Path) -> _Graph:
     )
 
 
-def _chosen(graphs: list[_Graph], size: tuple[int, int] | None, aspect: float) -> _Graph:
+def _chosen(graphs: list[_Graph], size: tuple[int, int] | None, aspect: float, option: str | None = None) -> _Graph:
     if size is None:
         bent = {g.path: round(abs(float(np.log(g.size[1] / g.size[0] / aspect))), 2) for g in graphs}
         fitting = [g for g in graphs if bent[g.path] <= round(float(np.log(STRETCHED)), 2)]
@@ -122,7 +139,7 @@ def _chosen(graphs: list[_Graph], size: tuple[int, int] | None, aspect: float) -
             return graph
     known = ", ".join(f"{g.size[0]}x{g.size[1]}" for g in graphs)
     what = f"there is no graph for an input of {size[0]}x{size[1]}"
-    raise ModelError(Problem("bad-size", str(graphs[0].path.parent), what, f"There are: {known}."))
+    raise ModelError(Problem("bad-size", option or str(graphs[0].path.parent), what, f"There are: {known}."))
 
 
 def _spec(graph: _Graph) -> InputSpec:

@@ -89,10 +89,7 @@ class Scratch(Backbone):
 
     def __init__(self, size: tuple[int, int], width: float = 1.0) -> None:
         super().__init__()
-        if size[0] % COARSEST or size[1] % COARSEST:
-            what = f"the encoder halves its input four times, and {size[0]}x{size[1]} is no multiple of {COARSEST}"
-            near = "x".join(str(max(1, round(s / COARSEST)) * COARSEST) for s in size)
-            raise ModelError(Problem("bad-size", "--size", what, f"Take {near}."))
+        self.check(size)
         self.spec = InputSpec(name="image", height=size[0], width=size[1], mean=MEAN, std=STD)
         stem, quarter, eighth, sixteenth, decoder, fine = (
             max(8, int(c * width)) for c in (STEM, QUARTER, EIGHTH, SIXTEENTH, DECODER, FINE)
@@ -122,6 +119,13 @@ class Scratch(Backbone):
         x = self.smooth[1](_doubled(x) + self.laterals[2](quarter))
         out: Tensor = self.last(_doubled(self.narrow(x)) + self.detail(half))
         return out
+
+    def check(self, size: tuple[int, int], option: str = "--size") -> None:
+        """Refuse what is no multiple of 16."""
+        if size[0] % COARSEST or size[1] % COARSEST:
+            what = f"the encoder halves its input four times, and {size[0]}x{size[1]} is no multiple of {COARSEST}"
+            near = "x".join(str(max(1, round(s / COARSEST)) * COARSEST) for s in size)
+            raise ModelError(Problem("bad-size", option, what, f"Take {near}."))
 
     def at(self, size: tuple[int, int]) -> Scratch:
         """The same weights for another input: nothing in it depends on the size."""
