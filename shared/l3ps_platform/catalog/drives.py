@@ -9,11 +9,9 @@ from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import DriveRow, JobRow
 from l3ps_platform.catalog.session import Transaction
-from l3ps_platform.catalog.states import DriveState, JobState
+from l3ps_platform.catalog.states import ACTIVE, DriveState
 from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import new_id
-
-ACTIVE = (JobState.QUEUED, JobState.RUNNING)
 
 
 def add(

@@ -46,6 +46,10 @@ class JobState(StrEnum):
         return self in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED)
 
 
+ACTIVE = tuple(state for state in JobState if not state.final)
+"""States of jobs and trainings that are not over."""
+
+
 class StageState(StrEnum):
     """A stage's life; scenes use the same words."""
 

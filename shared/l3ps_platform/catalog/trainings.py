@@ -6,7 +6,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import TrainingRow
-from l3ps_platform.catalog.states import JobState
+from l3ps_platform.catalog.states import ACTIVE, JobState
 from l3ps_platform.errors import NotFound
 
 
@@ -41,8 +41,7 @@ def page(
 
 def unfinished(session: Session, name: str) -> TrainingRow | None:
     """The training that is to become the model of this name and is not over, if there is one."""
-    active = TrainingRow.state.in_((JobState.QUEUED, JobState.RUNNING))
-    query = select(TrainingRow).where(TrainingRow.name == name, active)
+    query = select(TrainingRow).where(TrainingRow.name == name, TrainingRow.state.in_(ACTIVE))
     return session.scalars(query.order_by(TrainingRow.id).limit(1)).one_or_none()
 
 
