@@ -86,3 +86,8 @@ class ProcessingError(L3psError):
 
 class Cancelled(L3psError):  # noqa: N818  (it is a request carried out, not an error)
     """The caller asked to stop; nothing half-done is left behind."""
+
+
+def first_line(error: BaseException) -> str:
+    """What somebody else's exception says, fit for a clause of one of our sentences."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

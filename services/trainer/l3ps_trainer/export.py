@@ -12,7 +12,6 @@ from typing import cast
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 from onnx import compose, version_converter
@@ -24,6 +23,7 @@ from .backbones import Backbone, DinoV2, OnnxGraph
 from .backbones.dinov2 import runtime_attention
 from .commute import convolve_before_enlarging
 from .heads import Heads
+from .runtime import session_of
 
 OPSET = 18
 LARGEST_FILE = 1 << 30
@@ -135,15 +135,6 @@ def agreement(network: Network, path: Path, inputs: Sequence[NDArray[np.float32]
             f"{100 * equal:.2f} % of the pixels get the same class; nothing was delivered"
         )
     return Agreement(worst, equal, len(inputs))
-
-
-def session_of(path: Path, threads: int) -> onnxruntime.InferenceSession:
-    """A session on the CPU that sleeps when idle."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def _softmax(logits: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as f
 
-IGNORED = 0
-"""Void: no loss, no score."""
+from .annotations import IGNORED
 
 
 def hard_cross_entropy(logits: Tensor, classes: Tensor, share: float, weights: Tensor | None = None) -> Tensor:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as f
 
+from .annotations import IGNORED
 from .augment import View
-from .losses import IGNORED
 from .views import Batch, Pool, Views
 
 

@@ -14,12 +14,12 @@ from PIL import Image
 from l3ps.segment.bundle import InputSpec
 from l3ps.segment.images import network_input
 
-from .annotations import Annotated, AnnotationSet, spread
+from .annotations import IGNORED, Annotated, AnnotationSet, spread
 from .backbones import Backbone
-from .export import Network, session_of
+from .export import Network
 from .heads import Heads
-from .losses import IGNORED
 from .reporting import Reporter, silent
+from .runtime import session_of
 
 EARLY_IMAGES = 8
 """Images that the figures during training are made of."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import stat
 import zipfile
 import zlib
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 from l3ps.errors import ModelError, Problem
@@ -15,7 +16,7 @@ MAX_RATIO = 50
 """How much a file over 64 MB may shrink in a zip; weights shrink by a tenth, a zip bomb by a thousand."""
 
 
-class BundleFiles:
+class BundleFiles(ABC):
     """The files of a bundle by name."""
 
     def __init__(self, where: str, names: set[str]) -> None:
@@ -39,11 +40,13 @@ class BundleFiles:
         self._left -= len(content)
         return content
 
+    @abstractmethod
     def _look(self, name: str) -> tuple[int, bool]:
-        raise NotImplementedError
+        """Bytes of a file as far as known without reading it, and whether it is a link."""
 
+    @abstractmethod
     def _content(self, name: str, size: int) -> bytes:
-        raise NotImplementedError
+        """The file, read up to one byte more than ``size``."""
 
 
 class FolderFiles(BundleFiles):

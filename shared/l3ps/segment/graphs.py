@@ -9,7 +9,7 @@ from typing import Any
 
 import onnx
 
-from l3ps.errors import Problem
+from l3ps.errors import Problem, first_line
 from l3ps.segment.bundle import InputSpec, ModelBundle
 
 MAX_NODES = 50_000
@@ -78,11 +78,6 @@ def look(bundle: ModelBundle, preset: str) -> Look:
     opset = max((o.version for o in model.opset_import if o.domain in {"", "ai.onnx"}), default=0)
     seen.facts |= {"opset": opset, "nodes": nodes, "int8": bool(operators & _INT8_OPERATORS)}
     return seen
-
-
-def first_line(error: Exception) -> str:
-    """What an error of a foreign library says, for a sentence."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def _inner(graph: onnx.GraphProto) -> Iterator[onnx.GraphProto]:

@@ -6,7 +6,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from l3ps.errors import ModelError, Problem
+from l3ps.errors import ModelError, Problem, first_line
 from l3ps.segment.bundle import ModelBundle
 
 CPU = ("CPUExecutionProvider",)
@@ -46,7 +46,7 @@ class Network:
                 options.add_external_initializers_from_files_in_memory(names, contents, [len(c) for c in contents])
             self.session = ort.InferenceSession(graph, options, providers=CPU)
         except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
-            raise _error(bundle, f"onnxruntime cannot load the graph ({_first_line(error)})") from error
+            raise _error(bundle, f"onnxruntime cannot load the graph ({first_line(error)})") from error
         self._check_signature()
 
     def run(
@@ -65,7 +65,7 @@ class Network:
         try:
             outputs = self.session.run(self._names, {self._bundle.info.input.name: planes}, options)
         except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
-            raise _error(self._bundle, f"it cannot run one image ({_first_line(error)})") from error
+            raise _error(self._bundle, f"it cannot run one image ({first_line(error)})") from error
         logits = outputs[0][0]
         classes = len(self._bundle.info.classes)
         if len(logits) != classes:
@@ -88,10 +88,6 @@ class Network:
         fits = len(shape) == 4 and all(not isinstance(s, int) or s == w for s, w in zip(shape, wanted, strict=True))
         if not fits:
             raise _error(self._bundle, f"the graph takes {shape}, model.json says {list(wanted)}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
 
 
 def _error(bundle: ModelBundle, what: str) -> ModelError:

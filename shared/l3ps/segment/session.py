@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from l3ps.segment.panoptic import PanopticImage, fuse
 from l3ps.segment.presets import FAST, SegmentPreset
 from l3ps.segment.scores import ClassScores, strongest
 from l3ps.segment.stream import in_order
-from l3ps.segment.tiles import averaged
+from l3ps.segment.tiles import at_size, averaged
 
 LANES = 2
 """Images in work at a time. Two passes side by side take less time than one after the other on twice the threads,
@@ -159,11 +158,5 @@ class Segmenter:
             return fuse(semantic, seen.size, min_area=self.min_area)
         if self.preset.fusion == "cuts":
             return fuse_cuts(semantic, seen.size, seen.inside, threshold=threshold, min_area=self.min_area)
-        interior = _at_size(seen.inside, semantic.shape) >= threshold
+        interior = at_size(seen.inside, semantic.shape) >= threshold
         return fuse(semantic, seen.size, interior=interior, min_area=self.min_area)
-
-
-def _at_size(plane: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    if plane.shape == shape:
-        return plane
-    return np.asarray(cv2.resize(plane, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), dtype=np.float32)

@@ -40,11 +40,11 @@ def averaged(
                 if classes is None:
                     classes = np.zeros((len(logits), *shape), dtype=np.float32)
                 for total, part in zip(classes[:, *window], _softmax(logits), strict=True):
-                    np.add(total, _at_size(part, total.shape), out=total)
+                    np.add(total, at_size(part, total.shape), out=total)
             if tiling in boundary and boundaries is not None:
                 if inside is None:
                     inside = np.zeros(shape, dtype=np.float32)
-                inside[window] += _at_size(boundaries, inside[window].shape)
+                inside[window] += at_size(boundaries, inside[window].shape)
     assert classes is not None
     with np.errstate(divide="ignore"):  # a class that no tile thinks possible
         classes = np.log(classes / len(semantic))
@@ -66,7 +66,7 @@ def _softmax(logits: Planes) -> Planes:
     return np.asarray(scores / scores.sum(axis=0), dtype=np.float32)
 
 
-def _at_size(plane: Planes, shape: tuple[int, ...]) -> Planes:
+def at_size(plane: Planes, shape: tuple[int, ...]) -> Planes:
     """A map at another resolution; a coarser one is the mean over what its pixels cover."""
     shrinks = shape[0] < plane.shape[0]
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

@@ -19,7 +19,7 @@ from l3ps_trainer import pastel
 from l3ps_trainer.annotations import NUSCENES_AND_SKY
 from l3ps_trainer.backbones import DinoV2
 from l3ps_trainer.command import app
-from l3ps_trainer.export import session_of
+from l3ps_trainer.runtime import session_of
 
 SIZE = (42, 70)
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as f
 
-from l3ps.errors import ModelError, Problem
+from l3ps.errors import ModelError, Problem, first_line
 
 from .base import Backbone, digest, input_spec
 
@@ -85,7 +85,7 @@ class DinoV2(Backbone):
         self, name: str, weights: Mapping[str, Tensor] | None, size: tuple[int, int], **architecture: Any
     ) -> None:
         super().__init__()
-        _check_size(size)
+        self.check(size)
         self.name, self.spec = name, input_spec(size)
         self._weights, self._architecture = weights, architecture
         self.variant = VARIANTS[name]
@@ -101,7 +101,10 @@ class DinoV2(Backbone):
 
     def check(self, size: tuple[int, int], option: str = "--size") -> None:
         """Refuse what is no multiple of 14."""
-        _check_size(size, option)
+        if size[0] % PATCH or size[1] % PATCH:
+            near = "x".join(str(max(1, round(s / PATCH)) * PATCH) for s in size)
+            what = f"DINOv2 sees patches of {PATCH} pixels, and {size[0]}x{size[1]} is no multiple of it"
+            raise ModelError(Problem("bad-size", option, what, f"Take {near}."))
 
     def at(self, size: tuple[int, int]) -> DinoV2:
         """The same weights for another input, the position embedding resized from the original."""
@@ -174,8 +177,7 @@ def read_state(file: Path) -> dict[str, Tensor]:
     except FileNotFoundError as error:
         raise _wrong(file, "there is no such file") from error
     except Exception as error:  # what the bytes of any file make of an unpickler
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise _wrong(file, f"it cannot be read as a torch state dict ({first[:160]})") from error
+        raise _wrong(file, f"it cannot be read as a torch state dict ({first_line(error)})") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise _wrong(file, "it holds no plain state dict of tensors")
     return state
@@ -247,13 +249,6 @@ def _impatient() -> Iterator[None]:
         yield
     finally:
         socket.setdefaulttimeout(before)
-
-
-def _check_size(size: tuple[int, int], option: str = "--size") -> None:
-    if size[0] % PATCH or size[1] % PATCH:
-        near = "x".join(str(max(1, round(s / PATCH)) * PATCH) for s in size)
-        what = f"DINOv2 sees patches of {PATCH} pixels, and {size[0]}x{size[1]} is no multiple of it"
-        raise ModelError(Problem("bad-size", option, what, f"Take {near}."))
 
 
 def _misfit(variant: Variant, what: str) -> ModelError:

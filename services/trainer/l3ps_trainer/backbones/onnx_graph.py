@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from l3ps.errors import ModelError, Problem
+from l3ps.errors import ModelError, Problem, first_line
 from l3ps.segment.bundle import InputSpec
 
+from ..runtime import session_of
 from .base import Backbone, input_spec
 
 STRETCHED = 1.5
@@ -59,14 +59,10 @@ class OnnxGraph(Backbone):
         self.file, self.output, self.channels, self.stride = chosen.path, chosen.output, chosen.channels, chosen.stride
         self.spec = _spec(chosen)
         self.identity = hashlib.sha256(chosen.path.read_bytes()).hexdigest()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(str(chosen.path), options, providers=["CPUExecutionProvider"])
+            self._session = session_of(chosen.path, threads)
         except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
-            raise _wrong(chosen.path, f"onnxruntime cannot load it ({str(error).splitlines()[0][:160]})") from error
+            raise _wrong(chosen.path, f"onnxruntime cannot load it ({first_line(error)})") from error
         self._try(chosen)
 
     def _try(self, graph: _Graph) -> None:
@@ -75,7 +71,7 @@ class OnnxGraph(Backbone):
         try:
             (features,) = self._session.run([graph.output], {graph.image: grey})
         except Exception as error:  # onnxruntime raises bare pybind exceptions without a common base
-            raise _wrong(graph.path, f"it cannot be run ({str(error).splitlines()[0][:160]})") from error
+            raise _wrong(graph.path, f"it cannot be run ({first_line(error)})") from error
         if features.dtype != np.float32 or features.shape[:2] != (1, graph.channels) or features.ndim != 4:
             raise _wrong(graph.path, f"it returns {features.dtype} {list(features.shape)} and declares otherwise")
         if not np.isfinite(features).all():
