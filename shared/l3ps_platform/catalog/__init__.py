@@ -1,11 +1,11 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
+``figures`` (sums for the metrics). What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, rules, stages, trainings, uploads
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
@@ -21,6 +21,7 @@ from l3ps_platform.catalog.models import (
     UploadRow,
 )
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
+from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
     DriveState,
@@ -36,6 +37,7 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ArrivalRow",
     "Base",
     "Catalog",
     "DriveRow",
@@ -48,6 +50,7 @@ __all__ = [
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RuleRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -64,6 +67,7 @@ __all__ = [
     "drives",
     "figures",
     "jobs",
+    "rules",
     "stages",
     "trainings",
     "uploads",

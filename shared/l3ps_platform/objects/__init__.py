@@ -4,6 +4,7 @@ from l3ps_platform.objects.directory import DirectoryStore, Incoming
 from l3ps_platform.objects.interface import ObjectInfo, ObjectStore, Part
 from l3ps_platform.objects.keys import check_key, content_type, segment
 from l3ps_platform.objects.signing import OBJECTS_PATH, Grant, Signer
+from l3ps_platform.objects.sources import Reference, Source, SourceStore, find_source, parse_sources
 from l3ps_platform.objects.stores import open_store
 
 __all__ = [
@@ -14,9 +15,14 @@ __all__ = [
     "ObjectInfo",
     "ObjectStore",
     "Part",
+    "Reference",
     "Signer",
+    "Source",
+    "SourceStore",
     "check_key",
     "content_type",
+    "find_source",
     "open_store",
+    "parse_sources",
     "segment",
 ]

@@ -3,6 +3,7 @@
 Functions take a transaction and change rows.
 
 accept_drive, accept_model     an upload is complete → ingest
+accept_source, settle_arrivals a log lies, or has arrived, in somebody else's bucket → ingest, job
 submit_job, cancel_job,        what clients ask for
   submit_training, cancel_training
 claim, prolong, report       a worker takes a stage and says it is alive
@@ -13,6 +14,7 @@ Reconciler, lease_lost         what nobody is left to report
 """
 
 from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, prolong, report
 from l3ps_platform.workflow.outcomes import (
     Cost,
@@ -26,7 +28,14 @@ from l3ps_platform.workflow.outcomes import (
     release,
     release_owned,
 )
-from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
+from l3ps_platform.workflow.planning import (
+    accept_drive,
+    accept_model,
+    accept_source,
+    error_json,
+    problems_of,
+    submit_job,
+)
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 
@@ -39,6 +48,7 @@ __all__ = [
     "Transaction",
     "accept_drive",
     "accept_model",
+    "accept_source",
     "cancel_job",
     "cancel_training",
     "cancelled",
@@ -56,6 +66,7 @@ __all__ = [
     "release",
     "release_owned",
     "report",
+    "settle_arrivals",
     "submit_job",
     "submit_training",
     "training_done",

@@ -22,6 +22,7 @@ from l3ps_platform.catalog.states import QueueName, StageState, UploadState
 from l3ps_platform.errors import Conflict, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.claims import changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
@@ -44,6 +45,7 @@ class Report:
     resent: int = 0
     uploads: int = 0
     archives: int = 0
+    arrivals: int = 0
 
 
 class Reconciler:
@@ -83,6 +85,7 @@ class Reconciler:
             resent=self._resend(),
             uploads=self._abort_uploads(),
             archives=self._delete_archives(),
+            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds),
         )
 
     def _expire_leases(self) -> int:
