@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
+.PHONY: help demo test bench bench-train lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -56,6 +56,9 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
+
+compose-chaos: setup ## the same, and kill -9 of every container in turn, each during a job; needs root
+	$(RUN) python deploy/compose_check.py --kill
 
 demo-model: setup-dev ## train the demo's model again, from thirty simulated images
 	rm -rf demo-model
