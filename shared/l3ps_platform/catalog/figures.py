@@ -77,7 +77,8 @@ def tallies(session: Session, since: datetime | None, before: datetime | None) -
     within = [func.sum(case((row.seconds <= bound, 1), else_=0)) for bound in BOUNDS]
     query = select(*kind, *sums, *within).where(*_between(since, before)).group_by(*kind)
     found: dict[Kind, Tally] = {}
-    for found_row in session.execute(query):
+    rows: Iterable[Sequence[Any]] = session.execute(query)
+    for found_row in rows:
         project_id, name, outcome, cause, cached = found_row[:5]
         count, seconds, cpu, peak, scans, points, size = found_row[5:12]
         found[Kind(project_id, name, Outcome(outcome), cause, cached)] = Tally(

@@ -110,7 +110,7 @@ def attempts(catalog: Catalog) -> list[tuple[int, str, str | None]]:
 
 
 def test_every_attempt_is_remembered_and_counted_with_its_cause(catalog: Catalog, play, sent, tidy, cost) -> None:
-    """One that ran out of disk, one whose worker was stopped, one whose worker was killed, one that brought a result."""
+    """One that ran out of disk, one whose worker was stopped, one whose worker was killed, and one that was done."""
     job = play.submit(scenes=1)
     error = {"message": "no space left", "problems": [], "cause": "disk-full"}
     play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=RETRY, cost=cost))
