@@ -6,6 +6,7 @@ past need be read once only. What is the case now is counted by indexes, whateve
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any

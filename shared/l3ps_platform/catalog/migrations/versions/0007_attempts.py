@@ -108,9 +108,9 @@ def _remember() -> None:
         *(sa.column(name) for name in ("project_id", "model_id", "kind", "job_id", "finished_at")),
         sa.column("figures", JSON),
     )
-    query = sa.select(jobs).where(jobs.c.quality.is_not(None), jobs.c.finished_at.is_not(None)).order_by(jobs.c.id.desc())
+    query = sa.select(jobs).where(jobs.c.quality.is_not(None), jobs.c.finished_at.is_not(None))
     latest: dict[tuple[str, str], sa.Row[tuple[object, ...]]] = {}
-    for row in op.get_bind().execute(query.limit(1000)):
+    for row in op.get_bind().execute(query.order_by(jobs.c.id.desc()).limit(1000)):
         latest.setdefault((row.model_id, row.quality["protocol"]), row)
     for (model_id, protocol), row in latest.items():
         op.execute(
