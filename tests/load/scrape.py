@@ -51,11 +51,11 @@ def measure(url: str, stages: int) -> None:
         f"{catalog.engine.dialect.name}: {stages} stages (filled in {filled:.0f} s), {series} series: "
         f"first {times[0] * 1000:.0f} ms, then median {median(later) * 1000:.0f} ms, slowest {later[-1] * 1000:.0f} ms"
     )
-    lists = {"all": {}, "running": {"state": JobState.RUNNING}, "failed": {"state": JobState.FAILED}}
+    lists = {"all": [], "running": [JobState.RUNNING], "failed": [JobState.FAILED]}
     for name, wanted in lists.items():
         started = time.perf_counter()
         with catalog.scoped("prj_default").reading() as session:
-            found = jobs.page(session, limit=51, **wanted)
+            found = jobs.page(session, jobs.Wanted(wanted), limit=51)
         print(f"  list {name}: {len(found)} jobs in {(time.perf_counter() - started) * 1000:.1f} ms")
     if "--profile" in sys.argv:
         profile = cProfile.Profile()
