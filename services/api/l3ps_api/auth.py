@@ -32,7 +32,7 @@ class Principal:
     key_id: str | None = None
 
 
-def authenticate(
+async def authenticate(
     request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 ) -> Principal:
     """Let a request pass that carries the token of the settings; anything passes where there is none."""

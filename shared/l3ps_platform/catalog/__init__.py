@@ -6,6 +6,7 @@ changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
@@ -36,6 +37,7 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "AttemptRow",
     "Base",
     "Catalog",
     "DriveRow",
@@ -43,8 +45,10 @@ __all__ = [
     "JobRow",
     "JobState",
     "Json",
+    "ModelFiguresRow",
     "ModelRow",
     "ModelState",
+    "Outcome",
     "Owned",
     "ProjectRow",
     "QueueName",

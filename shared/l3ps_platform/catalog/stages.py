@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, or_, select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import StageRow, StepRow
@@ -23,6 +23,12 @@ def get(session: Session, id: str) -> StageRow:
 def of_job(session: Session, job_id: str) -> list[StageRow]:
     """All stages of a job, its scenes' and its own, in the order they were planned."""
     return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
+
+
+def of_job_and_drive(session: Session, job_id: str, drive_id: str) -> list[StageRow]:
+    """The stages that a job's client sees: the check of its drive, and :func:`of_job`."""
+    seen = or_(StageRow.job_id == job_id, StageRow.drive_id == drive_id)
+    return list(session.scalars(select(StageRow).where(seen).order_by(StageRow.id)))
 
 
 def of_scene(session: Session, scene_id: str) -> list[StageRow]:

@@ -18,10 +18,12 @@ from sqlalchemy import CursorResult, Update, select, update
 
 from l3ps.errors import Cancelled
 from l3ps_platform.catalog import bundles, drives, jobs, stages, trainings
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost, NotFound
+from l3ps_platform.workflow.attempts import note_end
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,7 @@ def claim(
             tx, update(StageRow).where(*mine, *abandoned).values(**lease, attempt=attempt + 1)
         ):
             return None
+        note_end(tx, stage, Outcome.LOST, error={"cause": "lease-lost"})
         taken = attempt + 1
     _mark_parents_running(tx, stage, parent)
     return Claim(

@@ -11,11 +11,13 @@ from sqlalchemy import delete, select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
+from l3ps_platform.workflow.attempts import note_end, note_figures
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
@@ -30,6 +32,7 @@ class Cost:
         cpu_seconds: processor time of the process, all threads.
         peak_mb: peak resident memory, MB.
         scans, points: what was processed.
+        bytes: what an ingest took in and other stages stored.
         cached: the output was there already and nothing was computed.
         steps: (seconds, peak MB) of each step inside the stage.
     """
@@ -39,6 +42,7 @@ class Cost:
     peak_mb: float = 0.0
     scans: int = 0
     points: int = 0
+    bytes: int = 0
     cached: bool = False
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -52,7 +56,13 @@ class Retry:
 
 
 def complete(
-    tx: Transaction, claim: Claim, cost: Cost, *, output_key: str | None = None, quality: Json | None = None
+    tx: Transaction,
+    claim: Claim,
+    cost: Cost,
+    *,
+    output_key: str | None = None,
+    quality: Json | None = None,
+    estimates: Json | None = None,
 ) -> None:
     """A segment, refine or publish stage is done: record it and enqueue what follows.
 
@@ -62,6 +72,7 @@ def complete(
         cost: what it cost.
         output_key: where its output lies.
         quality: for a refine stage the scene's, for a publish stage the job's.
+        estimates: for a publish stage what can be told of the job's labels without truth.
 
     Raises:
         LeaseLost: the stage is no longer ours; nothing was changed.
@@ -70,6 +81,7 @@ def complete(
     job = jobs.lock(tx.session, _must(stage.job_id))
     if stage.name is StageName.PUBLISH:
         job.quality = quality
+        note_figures(tx, job, quality, estimates)
     elif stage.scene_id is not None:
         scene = tx.session.get_one(SceneRow, stage.scene_id)
         if quality is not None:
@@ -226,6 +238,7 @@ def finish(
         values["fraction"] = 1.0
     if not changed(tx, update(StageRow).where(*owned(claim)).values(**values)):
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+    note_end(tx, stage, _OUTCOMES[state], cost=cost, error=error)
     if cost is not None:
         tx.session.execute(delete(StepRow).where(StepRow.stage_id == claim.stage_id))
         for name, (seconds, peak_mb) in cost.steps.items():
@@ -233,6 +246,15 @@ def finish(
     tx.session.flush()
     tx.session.refresh(stage)
     return stage
+
+
+_OUTCOMES = {
+    StageState.DONE: Outcome.DONE,
+    StageState.FAILED: Outcome.FAILED,
+    StageState.WAITING: Outcome.RETRIED,
+    StageState.QUEUED: Outcome.RELEASED,
+    StageState.CANCELLED: Outcome.CANCELLED,
+}
 
 
 def _plan_waiting(tx: Transaction, *, drive_id: str | None = None, model_id: str | None = None) -> None:

@@ -16,12 +16,14 @@ import structlog
 from sqlalchemy import select, update
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
 from l3ps_platform.catalog.states import QueueName, StageState, UploadState
 from l3ps_platform.errors import Conflict, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.claims import changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
@@ -196,6 +198,8 @@ def lease_lost(
     values = {"state": StageState.FAILED, "lease_owner": None, "lease_until": None, "finished_at": tx.now}
     if not changed(tx, update(StageRow).where(*conditions).values(**values, error=error)):
         return False
+    again = stage.attempt < retry.max_attempts
+    note_end(tx, stage, Outcome.LOST if again else Outcome.FAILED, error=error)
     tx.session.refresh(stage)
-    failed(tx, stage, retry if stage.attempt < retry.max_attempts else None)
+    failed(tx, stage, retry if again else None)
     return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 
 from sqlalchemy.orm import Session
@@ -37,10 +38,10 @@ def create(services: Services, request: JobRequest) -> Job:
     return get(services, job.id)
 
 
-def page(services: Services, limit: int, cursor: str | None, state: JobState | None) -> JobPage:
+def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted) -> JobPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
-        rows = jobs.page(session, limit=limit + 1, before=cursor, state=state)
+        rows = jobs.page(session, wanted, limit=limit + 1, before=cursor)
         shown = rows[:limit]
         of_drive = drives.many(session, [row.drive_id for row in shown])
         of_model = bundles.many(session, [row.model_id for row in shown])
@@ -59,7 +60,14 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
 def get(services: Services, job_id: str) -> Job:
     """One job in full. NotFound."""
     with services.catalog.reading() as session:
-        return _document(session, jobs.get(session, job_id))
+        return _document(session, job_id)
+
+
+def encoded(services: Services, job_id: str) -> bytes:
+    """The same as JSON, made anew only when something has changed. NotFound."""
+    with services.catalog.reading() as session:
+        revision = jobs.revision(session, job_id)
+        return services.documents.get(job_id, revision, lambda: _document(session, job_id).model_dump_json().encode())
 
 
 def cancel(services: Services, job_id: str) -> Job:
@@ -69,18 +77,19 @@ def cancel(services: Services, job_id: str) -> Job:
     return get(services, job_id)
 
 
-def _document(session: Session, job: JobRow) -> Job:
-    planned = stages.of_job(session, job.id)
-    ingest = stages.ingest_of(session, drive_id=job.drive_id)
-    rows = [ingest, *planned] if ingest is not None else planned
+def _document(session: Session, job_id: str) -> Job:
+    job, drive, model = jobs.with_inputs(session, job_id)
+    rows = stages.of_job_and_drive(session, job.id, job.drive_id)
+    planned = [row for row in rows if row.job_id == job.id]
     steps = stages.steps(session, [row.id for row in rows])
-    drive = drives.many(session, [job.drive_id])[job.drive_id]
-    model = bundles.get(session, job.model_id)
     done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
         return [stage_document(row, steps[row.id]) for row in chosen]
 
+    of_scene: dict[str | None, list[StageRow]] = defaultdict(list)
+    for row in planned:
+        of_scene[row.scene_id].append(row)
     scenes = [
         Scene(
             id=scene.id,
@@ -89,7 +98,7 @@ def _document(session: Session, job: JobRow) -> Job:
             scans=scene.scans,
             points=scene.points,
             state=scene.state,
-            stages=shown(row for row in planned if row.scene_id == scene.id),
+            stages=shown(of_scene[scene.id]),
         )
         for scene in jobs.scenes(session, job.id)
     ]
