@@ -9,9 +9,10 @@ from l3ps_platform.workflow import Cause, Reconciler, Retry, failure
 
 AWAY = failure("the store is away", Cause.STORE_UNAVAILABLE)
 CRASHED = failure("it was killed", Cause.CRASHED)
+AT_ONCE = Retry(3, 0.0, longest_seconds=0.0)
 
 
-def fail(play, error: dict, retry: Retry = Retry(3, 0.0)) -> str:
+def fail(play, error: dict, retry: Retry = AT_ONCE) -> str:
     """Fail the stage of the next message; the message of its next attempt is in ``sent`` if there is one."""
     message = play.sent[0]
     play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=retry))
@@ -62,9 +63,8 @@ def test_a_lease_that_is_taken_over_counts_as_a_failure(play, sent) -> None:
     play.submit(scenes=1)
     message = sent[0]
     for attempt, taken in ((1, 1), (1, 2), (2, 3)):
-        assert (
-            play.take(StageMessage(message.stage_id, attempt, message.name, message.queue), lease=-1).attempt == taken
-        )
+        claim = play.take(StageMessage(message.stage_id, attempt, message.name, message.queue), lease=-1)
+        assert claim.attempt == taken
     assert play.stage(message.stage_id).failures == 2
     assert play.stage(message.stage_id).error["cause"] == "lease-lost"
 

@@ -82,9 +82,9 @@ def test_outputs_that_are_gone_are_made_again(play, sent) -> None:
 def test_a_job_cancelled_before_its_drive_was_checked_is_planned(play, sent) -> None:
     with play.catalog.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=9, object_key="k").id
-    check = sent.pop()
+    check, model = sent.pop(), play.model()
     with play.catalog.transaction() as tx:
-        job = workflow.submit_job(tx, drive_id=drive, model=play.model()).id
+        job = workflow.submit_job(tx, drive_id=drive, model=model).id
     with play.catalog.transaction() as tx:
         workflow.cancel_job(tx, job)
     info = {"scenes": [{"name": "a", "scans": 1, "points": 5}]}
