@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, jobs, stages, trainings
-from l3ps_platform.catalog.models import JobRow, ModelRow, SceneRow, StageRow, TrainingRow
+from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import Conflict
@@ -70,7 +69,7 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
         Conflict: it has succeeded or is not over, its name was taken meanwhile, or its annotations are gone.
     """
     training = trainings.get(tx.session, training_id)
-    holder = tx.session.scalars(select(ModelRow).where(ModelRow.name == training.name).with_for_update()).one_or_none()
+    holder = bundles.named(tx.session, training.name, training.project_id)
     training = trainings.lock(tx.session, training_id)
     if training.state not in _AGAIN:
         raise Conflict(f"training {training_id} is {training.state}: only a failed or cancelled one can be run again")

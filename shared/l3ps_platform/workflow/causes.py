@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from enum import StrEnum
 
 from l3ps.errors import Cancelled, InputError, ProcessingError
-from l3ps_platform.catalog.models import Json
+from l3ps_platform.catalog.base import Json
 from l3ps_platform.errors import CatalogUnavailable, LeaseLost, QueueUnavailable, StoreUnavailable
 
 
