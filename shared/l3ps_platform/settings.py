@@ -96,17 +96,29 @@ class Settings(BaseSettings):
     heartbeat_seconds: float = 10.0
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
+    # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
+    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    outage_retry_seconds: float = 60.0
+    outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0
     # A queued stage without a claim for this long whose message is not in the queue is sent again.
     resend_seconds: float = 30.0
+    # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
+    cancel_seconds: float = 10.0
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis
     # would deliver the message a second time.
     train_seconds: float = Field(default=20 * 3600.0, gt=0, lt=24 * 3600)
     progress_seconds: float = 0.5
+    # When Redis delivers a message again that nobody has acknowledged. Redelivery is no part of our recovery (leases
+    # are), so messages of long stages must not come back while they run: a task of 14 s under a visibility timeout of
+    # 5 s was started three times. Claims make that harmless, but each costs a look at the catalog.
+    visibility_seconds: int = Field(default=24 * 3600, gt=0)
 
     threads: int = 2  # of numeric libraries, per worker process
+    # Workers yield the processor to an API on the same machine, whose answers take milliseconds.
+    nice: int = Field(default=10, ge=0, le=19)
     concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
 
     # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping

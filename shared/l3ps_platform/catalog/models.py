@@ -204,6 +204,8 @@ class StageRow(Base):
     train stage a training.
     ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
     count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
+    ``attempt`` only rises, so that no late message fits; ``failures`` counts the attempts that failed by a fault of the
+    stage's own, and ``outage_since`` is when what it stands on began to fail it (l3ps_platform.workflow.causes).
     """
 
     __tablename__ = "stages"
@@ -227,6 +229,8 @@ class StageRow(Base):
     queue: Mapped[QueueName]
     state: Mapped[StageState] = mapped_column(default=StageState.WAITING)
     attempt: Mapped[int] = mapped_column(default=1)
+    failures: Mapped[int] = mapped_column(default=0, server_default="0")
+    outage_since: Mapped[datetime | None]
     not_before: Mapped[datetime | None]
     lease_owner: Mapped[str | None]
     lease_until: Mapped[datetime | None]

@@ -54,3 +54,9 @@ def get_job(job_id: str, services: ServicesDep) -> Response:
 def cancel_job(job_id: str, services: ServicesDep) -> Job:
     """Ask a job to stop; what runs stops at its next scan. Refused when the job is over."""
     return service.cancel(services, job_id)
+
+
+@router.post("/{job_id}/retry", status_code=202)
+def retry_job(job_id: str, services: ServicesDep) -> Job:
+    """Run a failed or cancelled job again: only what is missing. Refused in every other state."""
+    return service.retry(services, job_id)

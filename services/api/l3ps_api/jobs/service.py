@@ -12,7 +12,7 @@ from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, S
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
-from l3ps_platform.workflow import cancel_job, submit_job
+from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -74,6 +74,16 @@ def cancel(services: Services, job_id: str) -> Job:
     """Ask a job to stop. NotFound, Conflict when it is over."""
     with services.catalog.transaction() as tx:
         cancel_job(tx, job_id)
+    return get(services, job_id)
+
+
+def retry(services: Services, job_id: str) -> Job:
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    with services.catalog.reading() as session:
+        wanted = outputs_to_keep(session, job_id)
+    gone = [key for key in wanted if not services.store.exists(key)]
+    with services.catalog.transaction() as tx:
+        retry_job(tx, job_id, gone)
     return get(services, job_id)
 
 

@@ -20,7 +20,7 @@ from l3ps_api.trainings.schemas import (
 from l3ps_platform.catalog import JobState, UploadState, annotation_sets, bundles, stages, trainings, uploads
 from l3ps_platform.errors import Conflict, NotFound, ObjectMissing
 from l3ps_platform.ids import is_id
-from l3ps_platform.workflow import cancel_training, submit_training
+from l3ps_platform.workflow import cancel_training, retry_training, submit_training
 
 _LOG_TAIL = 4000
 """Bytes of the log that a document carries: some forty lines."""
@@ -91,6 +91,13 @@ def cancel(services: Services, training_id: str) -> Training:
     """Ask a training to stop. NotFound."""
     with services.catalog.transaction() as tx:
         cancel_training(tx, training_id)
+    return get(services, training_id)
+
+
+def retry(services: Services, training_id: str) -> Training:
+    """Run a failed or cancelled training again. NotFound, Conflict for another."""
+    with services.catalog.transaction() as tx:
+        retry_training(tx, training_id)
     return get(services, training_id)
 
 
