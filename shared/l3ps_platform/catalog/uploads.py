@@ -56,6 +56,18 @@ def get(session: Session, id: str) -> UploadRow:
     return row
 
 
+def page(
+    session: Session, *, limit: int = 50, before: str | None = None, state: UploadState | None = None
+) -> list[UploadRow]:
+    """Uploads, newest first, after the cursor ``before`` (the last id of the page before)."""
+    query = select(UploadRow)
+    if before is not None:
+        query = query.where(UploadRow.id < before)
+    if state is not None:
+        query = query.where(UploadRow.state == state)
+    return list(session.scalars(query.order_by(UploadRow.id.desc()).limit(limit)))
+
+
 def lock(session: Session, id: str) -> UploadRow:
     """One upload, held against concurrent changes until the transaction ends. NotFound."""
     row = session.scalars(select(UploadRow).where(UploadRow.id == id).with_for_update()).one_or_none()

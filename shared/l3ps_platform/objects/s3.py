@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO, cast
-from urllib.parse import quote
 
 import urllib3
 from minio import Minio
@@ -21,7 +20,7 @@ from urllib3.response import BaseHTTPResponse
 
 from l3ps_platform.errors import ObjectMissing, StoreUnavailable, UploadError
 from l3ps_platform.objects.interface import GONE, ObjectInfo, Part, Pending
-from l3ps_platform.objects.keys import check_key, check_prefix, content_type
+from l3ps_platform.objects.keys import attachment, check_key, check_prefix, content_type
 from l3ps_platform.objects.presign import Presigner
 from l3ps_platform.objects.s3_stream import S3Stream
 from l3ps_platform.settings import S3Location
@@ -152,7 +151,7 @@ class S3Store:
         """A URL that downloads the object."""
         query = {}
         if filename is not None:
-            query["response-content-disposition"] = f"attachment; filename*=UTF-8''{quote(filename)}"
+            query["response-content-disposition"] = attachment(filename)
         return self._presigner.url("GET", check_key(key), seconds, query=query)
 
     def presign_put(self, key: str, seconds: int) -> str:
