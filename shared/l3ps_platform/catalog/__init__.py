@@ -1,11 +1,26 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
+``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``. What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    bundles,
+    drives,
+    figures,
+    jobs,
+    keys,
+    projects,
+    quotas,
+    requests,
+    stages,
+    trainings,
+    uploads,
+)
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
@@ -36,6 +51,7 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
     "Base",
     "Catalog",
     "DriveRow",
@@ -48,6 +64,7 @@ __all__ = [
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -64,6 +81,10 @@ __all__ = [
     "drives",
     "figures",
     "jobs",
+    "keys",
+    "projects",
+    "quotas",
+    "requests",
     "stages",
     "trainings",
     "uploads",
