@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Response
 
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_platform.catalog import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -26,7 +26,7 @@ def create_job(request: JobRequest, response: Response, services: ServicesDep) -
 def list_jobs(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("job")] = None,
     state: Annotated[JobState | None, Query(description="Only jobs in this state.")] = None,
 ) -> JobPage:
     """Jobs, newest first."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from datetime import UTC, datetime
 from typing import Any
 
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
+from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
@@ -21,6 +23,7 @@ from l3ps_platform.catalog import (
     annotation_sets,
     bundles,
     drives,
+    quotas,
     uploads,
 )
 from l3ps_platform.errors import Conflict, NotFound, UploadError
@@ -61,6 +64,9 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     multipart = services.store.create_multipart(key)
     try:
         with services.catalog.transaction() as tx:
+            if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
+                remedy = "Complete some of them, or give them up."
+                raise over_quota("uploads", settings.max_open_uploads, "open uploads", remedy)
             row = uploads.add(
                 tx,
                 id=upload_id,
@@ -85,6 +91,18 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     ]
     size = part_size(request.size, settings)
     return OpenUpload(**_fields(row), part_size=size, parts=urls)
+
+
+def opened(services: Services, upload_id: str) -> OpenUpload:
+    """An upload as its opening answered, with fresh URLs. NotFound."""
+    with services.catalog.reading() as session:
+        row = uploads.get(session, upload_id)
+    left = max(1, int((row.expires_at - datetime.now(UTC)).total_seconds()))
+    urls = [
+        PartUrl(number=number, url=services.store.presign_part(row.object_key, row.s3_upload_id, number, left))
+        for number in range(1, row.parts + 1)
+    ]
+    return OpenUpload(**_fields(row), part_size=part_size(row.size, services.settings), parts=urls)
 
 
 def get(services: Services, upload_id: str) -> Upload:
