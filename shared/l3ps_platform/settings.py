@@ -68,7 +68,26 @@ class Settings(BaseSettings):
     public_url: str = ""  # empty: http://host:port
     host: str = "127.0.0.1"
     port: int = 8080
-    token: SecretStr | None = None  # None: no authentication, for loopback only
+    # The operator's. None: on loopback whoever reaches the service is the operator, elsewhere only API keys get in.
+    token: SecretStr | None = None
+    trusted_proxies: str = ""  # addresses whose X-Forwarded-For is believed, comma-separated; empty: nobody's
+
+    # What one API key (or, without keys, one address) may ask: 200 clients that each ask once a second under one key
+    # must pass, with room for what else they do.
+    rate_per_second: float = Field(default=1000.0, gt=0)
+    rate_burst: int = Field(default=2000, ge=1)
+    # Wrong credentials from one address. Secrets hold 256 bits, so this is about load, not about guessing.
+    failures_per_second: float = Field(default=10.0, gt=0)
+    failures_burst: int = Field(default=20, ge=1)
+    # How long a process believes what it has read about a key. In the process that revokes one it ends at once.
+    key_cache_seconds: float = Field(default=2.0, ge=0)
+    max_open_uploads: int = Field(default=1000, ge=1)  # of a project
+    max_active_jobs: int = Field(default=1000, ge=1)  # of a project, trainings too
+
+    idempotency_seconds: float = Field(default=24 * 3600.0, gt=0)  # life of an Idempotency-Key
+    # How long a request with a key is waited for before it is taken for dead. Joining the parts of the largest upload
+    # takes seconds; one that takes longer and still lives cannot commit once another has taken over.
+    idempotency_lease_seconds: float = Field(default=60.0, gt=0)
 
     scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
     # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
@@ -154,6 +173,11 @@ class Settings(BaseSettings):
         elif value and not value.startswith("file:///"):
             raise ValueError("the object store is file:///DIR or s3://KEY:SECRET@host:port/bucket")
         return value
+
+    @property
+    def loopback(self) -> bool:
+        """Whether the API is reached from this machine alone."""
+        return self.host in ("127.0.0.1", "localhost", "::1")
 
     @property
     def catalog_url(self) -> str:

@@ -45,7 +45,10 @@ def demo(
             if drive:
                 check_log(drive)
             log = drive or _simulated(data / "drive")
-            with Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack, Client(stack.url) as client:
+            with (
+                Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack,
+                Client(stack.url, stack.token) as client,
+            ):
                 job = _run(client, stack, log, model or DEMO_MODEL, preset, segment)
                 labels = data / "labels" / job["id"]
                 fetch_labels(client, job["id"], labels)

@@ -1,11 +1,26 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
+``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``. What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    bundles,
+    drives,
+    figures,
+    jobs,
+    keys,
+    projects,
+    quotas,
+    requests,
+    stages,
+    trainings,
+    uploads,
+)
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
 from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
@@ -37,6 +52,7 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
     "AttemptRow",
     "Base",
     "Catalog",
@@ -52,6 +68,7 @@ __all__ = [
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -68,6 +85,10 @@ __all__ = [
     "drives",
     "figures",
     "jobs",
+    "keys",
+    "projects",
+    "quotas",
+    "requests",
     "stages",
     "trainings",
     "uploads",

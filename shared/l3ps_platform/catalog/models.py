@@ -30,6 +30,7 @@ class ProjectRow(Base):
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str] = mapped_column(String(200), unique=True)
     created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
 
 
 class UploadRow(Owned, Base):

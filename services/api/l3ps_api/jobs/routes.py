@@ -9,7 +9,7 @@ from pydantic import AwareDatetime
 
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_platform.catalog import JobState, jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -27,7 +27,7 @@ def create_job(request: JobRequest, response: Response, services: ServicesDep) -
 def list_jobs(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("job")] = None,
     state: Annotated[
         list[JobState] | None, Query(description="Only jobs in this state; may be given several times.")
     ] = None,

@@ -9,9 +9,10 @@ from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
+from l3ps_api.limits import over_quota
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
 from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
 
 _STEPS = (
@@ -25,6 +26,7 @@ def create(services: Services, request: JobRequest) -> Job:
     """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
     try:
         with services.catalog.transaction() as tx:
+            check_active_jobs(services, tx.session)
             job = submit_job(tx, **request.model_dump())
     except InputError as error:
         found = error.problems
@@ -36,6 +38,13 @@ def create(services: Services, request: JobRequest) -> Job:
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
     return get(services, job.id)
+
+
+def check_active_jobs(services: Services, session: Session) -> None:
+    """429 where the project has as many jobs and trainings under way as it may; a few more when asked in parallel."""
+    limit = services.settings.max_active_jobs
+    if quotas.active_jobs(session) >= limit:
+        raise over_quota("jobs", limit, "jobs and trainings under way", "Wait for some to end, or cancel them.")
 
 
 def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted) -> JobPage:
