@@ -1,12 +1,26 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
+``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``. What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    bundles,
+    drives,
+    events,
+    figures,
+    jobs,
+    stages,
+    trainings,
+    uploads,
+    webhooks,
+)
 from l3ps_platform.catalog.base import Base, Json, Owned
+from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
+from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -23,6 +37,7 @@ from l3ps_platform.catalog.models import (
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -38,8 +53,12 @@ __all__ = [
     "AnnotationsRow",
     "Base",
     "Catalog",
+    "DeliveryRow",
+    "DeliveryState",
     "DriveRow",
     "DriveState",
+    "EventKind",
+    "EventRow",
     "JobRow",
     "JobState",
     "Json",
@@ -59,12 +78,15 @@ __all__ = [
     "Transaction",
     "UploadRow",
     "UploadState",
+    "WebhookRow",
     "annotation_sets",
     "bundles",
     "drives",
+    "events",
     "figures",
     "jobs",
     "stages",
     "trainings",
     "uploads",
+    "webhooks",
 ]

@@ -16,6 +16,7 @@ from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
@@ -79,6 +80,7 @@ def complete(
             enqueue(tx, waiting[0])
         elif not waiting:
             scene.state = StageState.DONE
+            notices.of_scene(tx, job, scene, stage)
     settle_job(tx, job)
 
 
@@ -100,6 +102,7 @@ def drive_checked(
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     drive.sha256, drive.format, drive.info = sha256, format, info
     tx.session.flush()
+    notices.of_upload(tx, drive)
     _plan_waiting(tx, drive_id=drive.id)
 
 
@@ -119,6 +122,7 @@ def model_checked(
     model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     model.sha256, model.info = sha256, info
     tx.session.flush()
+    notices.of_upload(tx, model)
     _plan_waiting(tx, model_id=model.id)
 
 
@@ -144,6 +148,7 @@ def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
         stage.not_before = tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.attempt - 1))
         stage.attempt += 1
         tx.session.flush()
+        notices.of_retry(tx, parent, stage)
     elif parent is not None:
         cancel_rest_of_scene(tx, stage, StageState.FAILED)
         settle(tx, parent)
@@ -255,9 +260,11 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept
+        notices.of_upload(tx, drive)
     if stage.model_id is not None:
         model = bundles.lock(tx.session, stage.model_id)
         model.state, model.problem = ModelState.REJECTED, kept
+        notices.of_upload(tx, model)
     tx.session.flush()
     _plan_waiting(tx, drive_id=stage.drive_id, model_id=stage.model_id)
 
