@@ -23,6 +23,7 @@ from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost, NotFound
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
 
@@ -194,6 +195,7 @@ def _mark_parents_running(tx: Transaction, stage: StageRow, parent: JobRow | Tra
     if parent is not None and parent.state is JobState.QUEUED:
         parent.state = JobState.RUNNING
         parent.started_at = tx.now
+        notices.of_parent(tx, parent)
     if stage.scene_id is not None:
         scene = tx.session.get(SceneRow, stage.scene_id)
         if scene is not None:

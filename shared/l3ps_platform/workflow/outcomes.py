@@ -18,6 +18,7 @@ from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.attempts import note_again, note_end, note_figures
 from l3ps_platform.workflow.causes import Cause, failure, stored_cause
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
@@ -109,6 +110,7 @@ def complete(
             enqueue(tx, waiting[0])
         elif not waiting:
             scene.state = StageState.DONE
+            notices.of_scene(tx, job, scene, stage)
     settle_job(tx, job)
 
 
@@ -130,6 +132,7 @@ def drive_checked(
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     drive.sha256, drive.format, drive.info = sha256, format, info
     tx.session.flush()
+    notices.of_upload(tx, drive)
     _plan_waiting(tx, drive_id=drive.id)
 
 
@@ -149,6 +152,7 @@ def model_checked(
     model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     model.sha256, model.info = sha256, info
     tx.session.flush()
+    notices.of_upload(tx, model)
     _plan_waiting(tx, model_id=model.id)
 
 
@@ -186,6 +190,7 @@ def failed(tx: Transaction, stage: StageRow, retry: Retry | None, again: Outcome
         stage.state, stage.not_before, stage.finished_at = StageState.WAITING, moment, None
         stage.attempt += 1
         tx.session.flush()
+        notices.of_retry(tx, parent, stage)
     elif parent is not None:
         cancel_rest_of_scene(tx, stage, StageState.FAILED)
         settle(tx, parent)
@@ -327,9 +332,11 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept
+        notices.of_upload(tx, drive)
     if stage.model_id is not None:
         model = bundles.lock(tx.session, stage.model_id)
         model.state, model.problem = ModelState.REJECTED, kept
+        notices.of_upload(tx, model)
     tx.session.flush()
     _plan_waiting(tx, drive_id=stage.drive_id, model_id=stage.model_id)
 
