@@ -13,7 +13,7 @@ import threading
 import time
 from typing import Literal, get_args
 
-Prefix = Literal["ann", "drv", "job", "upl", "mdl", "scn", "stg", "trn"]
+Prefix = Literal["ann", "arr", "drv", "job", "key", "mdl", "msg", "prj", "rul", "scn", "stg", "trn", "upl", "whk"]
 
 _ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
 _RANDOM_BITS = 74

@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry
 
 from l3ps_api import errors, problems
 from l3ps_api.annotation_sets.routes import router as annotation_sets
-from l3ps_api.auth import require_token
+from l3ps_api.auth import authenticate
 from l3ps_api.drives.routes import router as drives
 from l3ps_api.jobs.routes import router as jobs
 from l3ps_api.labels.routes import router as labels
@@ -62,7 +62,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.token = settings.token.get_secret_value() if settings.token else None
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
-    guarded = [Depends(require_token)]
+    guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
     for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
 
+from l3ps_api.auth import PrincipalDep
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.queue import Queue
@@ -23,11 +24,20 @@ class Services:
     queue: Queue
 
 
-def _services(request: Request) -> Services:
+def _system(request: Request) -> Services:
     found: Services = request.app.state.services
     return found
 
 
-ServicesDep = Annotated[Services, Depends(_services)]
+SystemDep = Annotated[Services, Depends(_system)]
+"""For what belongs to no project: health, metrics, presigned objects."""
+
+
+def _own(system: SystemDep, principal: PrincipalDep) -> Services:
+    return replace(system, catalog=system.catalog.scoped(principal.project_id))
+
+
+ServicesDep = Annotated[Services, Depends(_own)]
+"""For what acts for a client: its catalog shows the rows of the caller's project alone."""
 Limit = Annotated[int, Query(ge=1, le=200, description="How many items at most.")]
 Cursor = Annotated[str | None, Query(description="`next` of the page before.", max_length=40)]

@@ -28,11 +28,12 @@ _NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
 
 
 def segment_key(
-    drive_sha256: str, model_sha256: str, scene: str, preset: Preset, look: SegmentPreset, *, skip: bool
+    project: str, drive_sha256: str, model_sha256: str, scene: str, preset: Preset, look: SegmentPreset, *, skip: bool
 ) -> str:
-    """Key of a scene's primal labels."""
+    """Key of a scene's primal labels; ``project`` by its id."""
     return _key(
         "segment",
+        project,
         drive=drive_sha256,
         model=model_sha256,
         scene=scene,
@@ -46,10 +47,17 @@ def segment_key(
 def refine_key(
     primal_key: str, preset: Preset, formats: list[str], protocol: str, max_points: int | None = None
 ) -> str:
-    """Key prefix of a scene's refined labels and label files; ``max_points`` where it is refined in chunks."""
+    """Key prefix of a scene's refined labels and label files; ``max_points`` where it is refined in chunks.
+
+    Args:
+        primal_key: of the scene's primal labels; it names the project too.
+        preset, formats, protocol: the job's.
+        max_points: the size of the chunks.
+    """
     chunks = {} if max_points is None else {"max_points": max_points}
     return _key(
         "refine",
+        primal_key.split("/")[1],
         **chunks,
         primal=primal_key,
         preset=preset.as_dict(),
@@ -59,16 +67,17 @@ def refine_key(
     )
 
 
-def train_key(annotations: list[str], settings: Mapping[str, Any], backbone: str) -> str:
+def train_key(project: str, annotations: list[str], settings: Mapping[str, Any], backbone: str) -> str:
     """Key prefix of a trained bundle and its checkpoint, whatever the model is called.
 
     Args:
+        project: its id.
         annotations: digests of the archives, those to measure on last.
         settings: of the training.
         backbone: digest of the backbone's files.
     """
     code = [trainer_version(), code_version(_BUNDLE)]
-    return _key("train", annotations=annotations, settings=dict(settings), backbone=backbone, code=code)
+    return _key("train", project, annotations=annotations, settings=dict(settings), backbone=backbone, code=code)
 
 
 @cache
@@ -106,6 +115,7 @@ def _covered(path: str, parts: tuple[str, ...]) -> bool:
     return below(parts) if parts else not below(_NOT_METHOD)
 
 
-def _key(stage: str, **inputs: Any) -> str:
+def _key(stage: str, project: str, **inputs: Any) -> str:
+    # Below the project: what one project has computed never answers another one's job, not even by being quick.
     text = json.dumps({"stage": stage, **inputs}, sort_keys=True, separators=(",", ":"))
-    return f"stages/{stage}-{hashlib.sha256(text.encode()).hexdigest()}"
+    return f"stages/{project}/{stage}-{hashlib.sha256(text.encode()).hexdigest()}"

@@ -38,5 +38,5 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
 def primal_key(work: SceneWork) -> str:
     """Where the scene's primal labels lie."""
     assert work.drive.sha256 is not None and work.model.sha256 is not None
-    inputs = work.drive.sha256, work.model.sha256, work.scene.name
+    inputs = work.job.project_id, work.drive.sha256, work.model.sha256, work.scene.name
     return f"{segment_key(*inputs, work.preset, work.look, skip=work.skip)}/primal.npz"

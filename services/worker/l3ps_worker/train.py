@@ -49,7 +49,7 @@ def train(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
                 (folder / name).symlink_to(images, target_is_directory=True)
                 inputs[name] = given.filename
                 digests.append(given.sha256 or "")
-        prefix = train_key(digests, row.settings, backbone.digest)
+        prefix = train_key(row.project_id, digests, row.settings, backbone.digest)
         run = TrainingRun(
             context, claim, progress, row, folder=folder, inputs=inputs, checkpoint_key=f"{prefix}/checkpoint.pt"
         )

@@ -6,13 +6,14 @@ changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
+    DEFAULT_PROJECT,
     AnnotationsRow,
-    Base,
     DriveRow,
     JobRow,
-    Json,
     ModelRow,
+    ProjectRow,
     SceneRow,
     StageRow,
     StepRow,
@@ -32,6 +33,7 @@ from l3ps_platform.catalog.states import (
 )
 
 __all__ = [
+    "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
     "Base",
@@ -43,6 +45,8 @@ __all__ = [
     "Json",
     "ModelRow",
     "ModelState",
+    "Owned",
+    "ProjectRow",
     "QueueName",
     "SceneRow",
     "Sender",

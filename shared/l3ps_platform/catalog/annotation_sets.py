@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import AnnotationsRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import ACTIVE
@@ -34,17 +35,13 @@ def add(
 
 def get(session: Session, id: str) -> AnnotationsRow:
     """One archive that is not deleted. NotFound."""
-    row = session.get(AnnotationsRow, id)
-    if row is None or row.deleted_at is not None:
-        raise NotFound("annotations", id)
-    return row
+    return queries.get(session, AnnotationsRow, id)
 
 
 def lock(session: Session, id: str) -> AnnotationsRow:
     """One archive that is not deleted, held against concurrent changes until the transaction ends. NotFound."""
-    query = select(AnnotationsRow).where(AnnotationsRow.id == id, AnnotationsRow.deleted_at.is_(None))
-    row = session.scalars(query.with_for_update(), execution_options={"populate_existing": True}).one_or_none()
-    if row is None:
+    row = queries.lock(session, AnnotationsRow, id)
+    if row.deleted_at is not None:
         raise NotFound("annotations", id)
     return row
 
@@ -53,18 +50,13 @@ def page(
     session: Session, *, limit: int = 50, before: str | None = None, sha256: str | None = None
 ) -> list[AnnotationsRow]:
     """Archives that are not deleted, newest first, after the cursor ``before`` (the last id of the page before)."""
-    query = select(AnnotationsRow).where(AnnotationsRow.deleted_at.is_(None))
-    if before is not None:
-        query = query.where(AnnotationsRow.id < before)
-    if sha256 is not None:
-        query = query.where(AnnotationsRow.sha256 == sha256)
-    return list(session.scalars(query.order_by(AnnotationsRow.id.desc()).limit(limit)))
+    wanted = [AnnotationsRow.sha256 == sha256] if sha256 is not None else []
+    return queries.page(session, AnnotationsRow, *wanted, limit=limit, before=before)
 
 
 def many(session: Session, ids: Iterable[str | None]) -> dict[str, AnnotationsRow]:
     """Archives by id, deleted ones too; ids without a row are left out."""
-    wanted = {id for id in ids if id is not None}
-    return {row.id: row for row in session.scalars(select(AnnotationsRow).where(AnnotationsRow.id.in_(wanted)))}
+    return queries.many(session, AnnotationsRow, ids)
 
 
 def delete(tx: Transaction, id: str) -> AnnotationsRow:

@@ -8,22 +8,32 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import JobRow, ModelRow, StageRow
-from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.session import Transaction, project_of
 from l3ps_platform.catalog.states import ModelState
-from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.errors import Conflict
 from l3ps_platform.ids import new_id
 
 
 def add(
-    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+    tx: Transaction,
+    *,
+    name: str,
+    filename: str,
+    size: int,
+    object_key: str,
+    sha256: str | None = None,
+    project_id: str | None = None,
 ) -> ModelRow:
     """A new model in state ``uploaded``; Conflict when the name is taken by a model that was not rejected.
 
+    It belongs to the given project, else to the transaction's.
     A rejected model that no job ever used gives up its name. :func:`l3ps_platform.workflow.accept_model` also has
     the new one checked.
     """
-    taken = tx.session.scalars(select(ModelRow).where(ModelRow.name == name).with_for_update()).one_or_none()
+    project_id = project_of(tx.session, project_id)
+    taken = named(tx.session, name, project_id)
     if taken is not None:
         if taken.state is not ModelState.REJECTED:
             raise Conflict(f"there is a model named {name!r} already: choose another name")
@@ -38,6 +48,7 @@ def add(
         tx.session.flush()
     row = ModelRow(
         id=new_id("mdl"),
+        project_id=project_id,
         name=name,
         filename=filename,
         sha256=sha256,
@@ -56,38 +67,35 @@ def add(
 
 def get(session: Session, id: str) -> ModelRow:
     """One model by id. NotFound."""
-    row = session.get(ModelRow, id)
-    if row is None:
-        raise NotFound("model", id)
-    return row
+    return queries.get(session, ModelRow, id)
 
 
-def by_name(session: Session, name: str) -> ModelRow:
-    """One model by name, or by id. NotFound."""
-    row = session.scalars(select(ModelRow).where(ModelRow.name == name)).one_or_none()
+def named(session: Session, name: str, project_id: str | None = None) -> ModelRow | None:
+    """The model of this name in a project, held until the transaction ends; None where the name is free."""
+    mine = ModelRow.project_id == project_of(session, project_id)
+    return session.scalars(select(ModelRow).where(ModelRow.name == name, mine).with_for_update()).one_or_none()
+
+
+def by_name(session: Session, name: str, project_id: str | None = None) -> ModelRow:
+    """One model of a project by name, or by id; the project is the session's where none is given. NotFound."""
+    query = select(ModelRow).where(ModelRow.name == name, ModelRow.project_id == project_of(session, project_id))
+    row = session.scalars(query).one_or_none()
     return row if row is not None else get(session, name)
 
 
 def lock(session: Session, id: str) -> ModelRow:
     """One model, held against concurrent changes until the transaction ends. NotFound."""
-    query = select(ModelRow).where(ModelRow.id == id).with_for_update()
-    row = session.scalars(query, execution_options={"populate_existing": True}).one_or_none()
-    if row is None:
-        raise NotFound("model", id)
-    return row
+    return queries.lock(session, ModelRow, id)
 
 
 def page(session: Session, *, limit: int = 50, before: str | None = None) -> list[ModelRow]:
     """Models, newest first, after the cursor ``before`` (the last id of the page before)."""
-    query = select(ModelRow)
-    if before is not None:
-        query = query.where(ModelRow.id < before)
-    return list(session.scalars(query.order_by(ModelRow.id.desc()).limit(limit)))
+    return queries.page(session, ModelRow, limit=limit, before=before)
 
 
 def many(session: Session, ids: Iterable[str]) -> dict[str, ModelRow]:
     """Models by id; ids without a row are left out."""
-    return {row.id: row for row in session.scalars(select(ModelRow).where(ModelRow.id.in_(set(ids))))}
+    return queries.many(session, ModelRow, ids)
 
 
 def leftover_archives(session: Session, limit: int = 100) -> list[ModelRow]:

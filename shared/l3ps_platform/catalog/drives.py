@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import DriveRow, JobRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import ACTIVE, DriveState
@@ -35,34 +36,23 @@ def add(
 
 def get(session: Session, id: str) -> DriveRow:
     """One drive that is not deleted. NotFound."""
-    row = session.get(DriveRow, id)
-    if row is None or row.deleted_at is not None:
-        raise NotFound("drive", id)
-    return row
+    return queries.get(session, DriveRow, id)
 
 
 def lock(session: Session, id: str) -> DriveRow:
     """One drive, deleted or not, held against concurrent changes until the transaction ends. NotFound."""
-    query = select(DriveRow).where(DriveRow.id == id).with_for_update()
-    row = session.scalars(query, execution_options={"populate_existing": True}).one_or_none()
-    if row is None:
-        raise NotFound("drive", id)
-    return row
+    return queries.lock(session, DriveRow, id)
 
 
 def page(session: Session, *, limit: int = 50, before: str | None = None, sha256: str | None = None) -> list[DriveRow]:
     """Drives that are not deleted, newest first, after the cursor ``before`` (the last id of the page before)."""
-    query = select(DriveRow).where(DriveRow.deleted_at.is_(None))
-    if before is not None:
-        query = query.where(DriveRow.id < before)
-    if sha256 is not None:
-        query = query.where(DriveRow.sha256 == sha256)
-    return list(session.scalars(query.order_by(DriveRow.id.desc()).limit(limit)))
+    wanted = [DriveRow.sha256 == sha256] if sha256 is not None else []
+    return queries.page(session, DriveRow, *wanted, limit=limit, before=before)
 
 
 def many(session: Session, ids: Iterable[str]) -> dict[str, DriveRow]:
     """Drives by id, deleted ones too; ids without a row are left out."""
-    return {row.id: row for row in session.scalars(select(DriveRow).where(DriveRow.id.in_(set(ids))))}
+    return queries.many(session, DriveRow, ids)
 
 
 def in_use(session: Session, id: str) -> list[str]:

@@ -7,38 +7,27 @@ from collections.abc import Sequence
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import JobRow, SceneRow
 from l3ps_platform.catalog.states import JobState
-from l3ps_platform.errors import NotFound
 
 
 def get(session: Session, id: str) -> JobRow:
     """One job. NotFound."""
-    row = session.get(JobRow, id)
-    if row is None:
-        raise NotFound("job", id)
-    return row
+    return queries.get(session, JobRow, id)
 
 
 def lock(session: Session, id: str) -> JobRow:
     """One job, held against concurrent changes until the transaction ends. NotFound."""
-    query = select(JobRow).where(JobRow.id == id).with_for_update()
-    row = session.scalars(query, execution_options={"populate_existing": True}).one_or_none()
-    if row is None:
-        raise NotFound("job", id)
-    return row
+    return queries.lock(session, JobRow, id)
 
 
 def page(
     session: Session, *, limit: int = 50, before: str | None = None, state: JobState | None = None
 ) -> list[JobRow]:
     """Jobs, newest first, after the cursor ``before`` (the last id of the page before)."""
-    query = select(JobRow)
-    if before is not None:
-        query = query.where(JobRow.id < before)
-    if state is not None:
-        query = query.where(JobRow.state == state)
-    return list(session.scalars(query.order_by(JobRow.id.desc()).limit(limit)))
+    wanted = [JobRow.state == state] if state is not None else []
+    return queries.page(session, JobRow, *wanted, limit=limit, before=before)
 
 
 def scenes(session: Session, job_id: str) -> list[SceneRow]:

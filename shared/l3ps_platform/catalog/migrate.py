@@ -24,8 +24,8 @@ from l3ps_platform.settings import get_settings
 _LOCK = 7_335_401  # any constant: API replicas that start together migrate one after the other
 
 
-def upgrade(url: str) -> None:
-    """Create or migrate the catalog at ``url``; does nothing when it is current. Safe to run concurrently."""
+def upgrade(url: str, revision: str = "head") -> None:
+    """Create or migrate the catalog at ``url`` to a revision; nothing when it is current. Safe to run concurrently."""
     engine = make_engine(url)
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _without_foreign_keys)
@@ -34,7 +34,7 @@ def upgrade(url: str) -> None:
             if connection.dialect.name == "postgresql":
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
             if not is_current(connection):
-                command.upgrade(_config(connection), "head")
+                command.upgrade(_config(connection), revision)
     finally:
         engine.dispose()
 

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-from enum import StrEnum
-from typing import Any
+from datetime import datetime
 
-from sqlalchemy import (
-    JSON,
-    BigInteger,
-    DateTime,
-    Dialect,
-    Enum,
-    ForeignKey,
-    Index,
-    MetaData,
-    String,
-    TypeDecorator,
-    UniqueConstraint,
-)
-from sqlalchemy.dialects.postgresql import JSONB
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+from sqlalchemy import ForeignKey, Index, String, UniqueConstraint
+from sqlalchemy.orm import Mapped, mapped_column
 
+from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.states import (
     DriveState,
     JobState,
@@ -32,69 +18,26 @@ from l3ps_platform.catalog.states import (
     UploadState,
 )
 
-Json = dict[str, Any]
+DEFAULT_PROJECT = "prj_default"
+"""The project that is there from the start."""
 
 
-class UtcDateTime(TypeDecorator[datetime]):
-    """An aware UTC date on both databases (SQLite drops the zone)."""
+class ProjectRow(Base):
+    """A team's drives, models, jobs and labels; other projects see nothing of them."""
 
-    impl = DateTime(timezone=True)
-    cache_ok = True
+    __tablename__ = "projects"
 
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Store in UTC."""
-        return None if value is None else value.astimezone(UTC)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Return with its zone."""
-        if value is None:
-            return None
-        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+    id: Mapped[str] = mapped_column(String(32), primary_key=True)
+    name: Mapped[str] = mapped_column(String(200), unique=True)
+    created_at: Mapped[datetime]
 
 
-def _states(kind: type[StrEnum]) -> Enum:
-    # Plain text with a CHECK: a native PostgreSQL enum cannot lose a value and SQLite has none.
-    return Enum(
-        kind,
-        native_enum=False,
-        length=16,
-        create_constraint=True,
-        name=kind.__name__.lower(),
-        values_callable=lambda members: [member.value for member in members],
-    )
-
-
-class Base(DeclarativeBase):
-    """Base of every table."""
-
-    metadata = MetaData(
-        naming_convention={
-            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-            "uq": "uq_%(table_name)s_%(column_0_name)s",
-            "ck": "ck_%(table_name)s_%(constraint_name)s",
-            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
-            "pk": "pk_%(table_name)s",
-        }
-    )
-    type_annotation_map = {  # noqa: RUF012
-        Json: JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql"),
-        datetime: UtcDateTime(),
-        int: BigInteger(),
-        UploadState: _states(UploadState),
-        DriveState: _states(DriveState),
-        ModelState: _states(ModelState),
-        JobState: _states(JobState),
-        StageState: _states(StageState),
-        StageName: _states(StageName),
-        QueueName: _states(QueueName),
-    }
-
-
-class UploadRow(Base):
+class UploadRow(Owned, Base):
     """A multipart upload in progress, or its memory."""
 
     __tablename__ = "uploads"
-    __table_args__ = (Index(None, "state", "expires_at"),)
+    noun = "upload"
+    __table_args__ = (Index(None, "state", "expires_at"), Index(None, "project_id", "id"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     kind: Mapped[str] = mapped_column(String(16))  # drive | model | annotations
@@ -110,7 +53,7 @@ class UploadRow(Base):
     expires_at: Mapped[datetime]
 
 
-class DriveRow(Base):
+class DriveRow(Owned, Base):
     """A drive log.
 
     ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
@@ -120,6 +63,8 @@ class DriveRow(Base):
     """
 
     __tablename__ = "drives"
+    noun = "drive"
+    __table_args__ = (Index(None, "project_id", "id"),)
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str]
@@ -135,13 +80,15 @@ class DriveRow(Base):
     deleted_at: Mapped[datetime | None]
 
 
-class ModelRow(Base):
+class ModelRow(Owned, Base):
     """A model bundle; ``info`` once ready: ``{"label_space", "classes", "input": [height, width], "has_boundary"}``."""
 
     __tablename__ = "models"
+    noun = "model"
+    __table_args__ = (UniqueConstraint("project_id", "name"), Index(None, "project_id", "id"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
-    name: Mapped[str] = mapped_column(String(200), unique=True)
+    name: Mapped[str] = mapped_column(String(200))
     filename: Mapped[str]
     sha256: Mapped[str | None] = mapped_column(String(64))
     size: Mapped[int]
@@ -152,10 +99,12 @@ class ModelRow(Base):
     created_at: Mapped[datetime]
 
 
-class AnnotationsRow(Base):
+class AnnotationsRow(Owned, Base):
     """An archive of annotated images. Only a training looks into it; ``sha256`` is the client's claim until then."""
 
     __tablename__ = "annotations"
+    noun = "annotations"
+    __table_args__ = (Index(None, "project_id", "id"),)
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str]
@@ -167,7 +116,7 @@ class AnnotationsRow(Base):
     deleted_at: Mapped[datetime | None]
 
 
-class JobRow(Base):
+class JobRow(Owned, Base):
     """One labelling of one drive with one model.
 
     ``settings``: ``{"preset", "segment", "formats": […], "protocol", "skip_bad_scans"}``.
@@ -176,7 +125,8 @@ class JobRow(Base):
     """
 
     __tablename__ = "jobs"
-    __table_args__ = (Index(None, "state"), Index(None, "drive_id"))
+    noun = "job"
+    __table_args__ = (Index(None, "state"), Index(None, "drive_id"), Index(None, "project_id", "id"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     drive_id: Mapped[str] = mapped_column(ForeignKey("drives.id"))
@@ -191,7 +141,7 @@ class JobRow(Base):
     finished_at: Mapped[datetime | None]
 
 
-class TrainingRow(Base):
+class TrainingRow(Owned, Base):
     """One training of a model on annotated images.
 
     ``name`` is the model's. ``settings``: what the client asked for, ``{"backbone", "recipe", "images", "size", …}``.
@@ -200,7 +150,8 @@ class TrainingRow(Base):
     """
 
     __tablename__ = "trainings"
-    __table_args__ = (Index(None, "state"), Index(None, "name"))
+    noun = "training"
+    __table_args__ = (Index(None, "state"), Index(None, "name"), Index(None, "project_id", "id"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str] = mapped_column(String(200))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import Any
 import structlog
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
+from l3ps_platform.catalog.base import Owned
 from l3ps_platform.catalog.states import QueueName, StageName
 from l3ps_platform.errors import CatalogUnavailable
 
@@ -41,6 +43,8 @@ Sender = Callable[[Sequence[StageMessage]], None]
 class Transaction:
     """A writing transaction: its session, its clock, and the messages to send once it is committed.
 
+    The session of a scoped catalog sees the rows of its project alone.
+
     Attributes:
         session: the SQLAlchemy session.
         now: one time for everything the transaction writes, by the database server's clock, so that workers
@@ -56,6 +60,8 @@ class Transaction:
 class Catalog:
     """The database. Cheap to make; connects on first use; make one per process (after a fork).
 
+    As made it shows all rows, as workers and the reconciler need it; :meth:`scoped` is for those who act for a client.
+
     Args:
         url: SQLAlchemy URL, ``sqlite:///PATH`` or ``postgresql+psycopg://…``.
         sender: called with the messages of a transaction after its commit; None drops them, which is right for
@@ -65,7 +71,14 @@ class Catalog:
     def __init__(self, url: str, sender: Sender | None = None) -> None:
         self.url = url
         self._sender = sender
+        self._project: str | None = None
         self.engine = make_engine(url)
+
+    def scoped(self, project_id: str) -> Catalog:
+        """This catalog as one project sees it: rows of others do not exist, new rows are the project's."""
+        scoped = copy(self)
+        scoped._project = project_id
+        return scoped
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
@@ -96,7 +109,7 @@ class Catalog:
 
     @contextmanager
     def _session(self, *, write: bool) -> Iterator[Session]:
-        with Session(self.engine, expire_on_commit=False) as session:
+        with _CatalogSession(self.engine, expire_on_commit=False, info={"project": self._project}) as session:
             try:
                 session.connection(execution_options={"l3ps_write": write})
                 yield session
@@ -117,6 +130,33 @@ class Catalog:
             self._sender(messages)
         except Exception:
             log.warning("messages not sent, the reconciler will", stages=[m.stage_id for m in messages], exc_info=True)
+
+
+class _CatalogSession(Session):
+    """A session that keeps to its project, if it has one."""
+
+
+def project_of(session: Session, project_id: str | None = None) -> str:
+    """The given project, else the one the session keeps to. ValueError where there is neither."""
+    found = project_id or session.info.get("project")
+    if found is None:
+        raise ValueError("this row needs a project: name one, or use a scoped catalog")
+    return str(found)
+
+
+@event.listens_for(_CatalogSession, "do_orm_execute")
+def _show_own_rows(state: ORMExecuteState) -> None:
+    project = state.session.info["project"]
+    if project is not None and not state.is_column_load and not state.is_relationship_load:
+        own = with_loader_criteria(Owned, lambda row: row.project_id == project, include_aliases=True)
+        state.statement = state.statement.options(own)
+
+
+@event.listens_for(_CatalogSession, "before_flush")
+def _own_new_rows(session: Session, _context: object, _instances: object) -> None:
+    for row in session.new:
+        if isinstance(row, Owned):
+            row.project_id = project_of(session, row.project_id)
 
 
 def make_engine(url: str) -> Engine:

@@ -5,38 +5,27 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import TrainingRow
 from l3ps_platform.catalog.states import ACTIVE, JobState
-from l3ps_platform.errors import NotFound
 
 
 def get(session: Session, id: str) -> TrainingRow:
     """One training. NotFound."""
-    row = session.get(TrainingRow, id)
-    if row is None:
-        raise NotFound("training", id)
-    return row
+    return queries.get(session, TrainingRow, id)
 
 
 def lock(session: Session, id: str) -> TrainingRow:
     """One training, held against concurrent changes until the transaction ends. NotFound."""
-    query = select(TrainingRow).where(TrainingRow.id == id).with_for_update()
-    row = session.scalars(query, execution_options={"populate_existing": True}).one_or_none()
-    if row is None:
-        raise NotFound("training", id)
-    return row
+    return queries.lock(session, TrainingRow, id)
 
 
 def page(
     session: Session, *, limit: int = 50, before: str | None = None, state: JobState | None = None
 ) -> list[TrainingRow]:
     """Trainings, newest first, after the cursor ``before`` (the last id of the page before)."""
-    query = select(TrainingRow)
-    if before is not None:
-        query = query.where(TrainingRow.id < before)
-    if state is not None:
-        query = query.where(TrainingRow.state == state)
-    return list(session.scalars(query.order_by(TrainingRow.id.desc()).limit(limit)))
+    wanted = [TrainingRow.state == state] if state is not None else []
+    return queries.page(session, TrainingRow, *wanted, limit=limit, before=before)
 
 
 def unfinished(session: Session, name: str) -> TrainingRow | None:

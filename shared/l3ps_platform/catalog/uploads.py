@@ -8,10 +8,11 @@ from typing import Literal
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import UploadRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import UploadState
-from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.errors import Conflict
 from l3ps_platform.ids import new_id
 
 
@@ -50,18 +51,12 @@ def add(
 
 def get(session: Session, id: str) -> UploadRow:
     """One upload. NotFound."""
-    row = session.get(UploadRow, id)
-    if row is None:
-        raise NotFound("upload", id)
-    return row
+    return queries.get(session, UploadRow, id)
 
 
 def lock(session: Session, id: str) -> UploadRow:
     """One upload, held against concurrent changes until the transaction ends. NotFound."""
-    row = session.scalars(select(UploadRow).where(UploadRow.id == id).with_for_update()).one_or_none()
-    if row is None:
-        raise NotFound("upload", id)
-    return row
+    return queries.lock(session, UploadRow, id)
 
 
 def close(tx: Transaction, id: str, state: UploadState, result_id: str | None = None) -> UploadRow:

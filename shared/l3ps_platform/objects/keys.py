@@ -57,7 +57,7 @@ def segment(name: str) -> str:
     """
     quoted = _UNSAFE.sub(lambda m: "".join(f"={byte:02X}" for byte in m[0].encode()), name)
     if not quoted or quoted[0] in ".-":
-        quoted = f"={ord(quoted[0]):02X}{quoted[1:]}" if quoted else "=00"
+        quoted = f"={ord(quoted[0]):02X}{quoted[1:]}" if quoted else "="
     if len(quoted) > MAX_SEGMENT:
         quoted = f"{quoted[: MAX_SEGMENT - 40]}={hashlib.sha256(name.encode()).hexdigest()[:39]}"
     return quoted

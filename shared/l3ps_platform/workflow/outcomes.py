@@ -11,7 +11,8 @@ from sqlalchemy import delete, select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
-from l3ps_platform.catalog.models import JobRow, Json, SceneRow, StageRow, StepRow
+from l3ps_platform.catalog.base import Json
+from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost

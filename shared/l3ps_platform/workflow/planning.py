@@ -7,7 +7,8 @@ from typing import Any
 
 from l3ps.errors import DriveLogError, InputError, ModelError, Problem
 from l3ps_platform.catalog import bundles, drives
-from l3ps_platform.catalog.models import DriveRow, JobRow, Json, ModelRow, SceneRow, StageRow
+from l3ps_platform.catalog.base import Json
+from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, SceneRow, StageRow
 from l3ps_platform.catalog.session import StageMessage, Transaction
 from l3ps_platform.catalog.states import QUEUE_OF, DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import NotFound

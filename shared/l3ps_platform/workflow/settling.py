@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy import func, select, update
 
-from l3ps_platform.catalog.models import JobRow, Json, SceneRow, StageRow, TrainingRow
+from l3ps_platform.catalog.base import Json
+from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageName, StageState
 from l3ps_platform.workflow.planning import enqueue

@@ -6,7 +6,8 @@ from sqlalchemy import select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import annotation_sets, bundles, trainings
-from l3ps_platform.catalog.models import Json, ModelRow, StageRow, TrainingRow
+from l3ps_platform.catalog.base import Json
+from l3ps_platform.catalog.models import StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import Conflict, LeaseLost
@@ -36,7 +37,7 @@ def submit_training(
     for id in sorted({annotations_id, validation_id or annotations_id}):
         annotation_sets.lock(tx.session, id)
     asked = (annotations_id, validation_id, settings)
-    holder = tx.session.scalars(select(ModelRow).where(ModelRow.name == name).with_for_update()).one_or_none()
+    holder = bundles.named(tx.session, name)
     if holder is not None and holder.state is not ModelState.REJECTED:
         made_it = trainings.of_model(tx.session, holder.id)
         if made_it is not None and asked == (made_it.annotations_id, made_it.validation_id, made_it.settings):
@@ -114,11 +115,12 @@ def training_done(
         report: the trainer's.
     """
     # In the order in which all take their locks: models before trainings before stages.
-    name = trainings.get(tx.session, _id(claim)).name
+    row = trainings.get(tx.session, _id(claim))
+    name = row.name
     try:
         with tx.session.begin_nested():
             file = {"filename": f"{name}.zip", "size": size, "object_key": object_key, "sha256": sha256}
-            model = bundles.add(tx, name=name, **file)  # type: ignore[arg-type]
+            model = bundles.add(tx, name=name, project_id=row.project_id, **file)  # type: ignore[arg-type]
     except Conflict as error:
         remedy = "Start the same training under another name; it is done already and takes a moment."
         problem = Problem("name-taken", "name", str(error).partition(":")[0], remedy)

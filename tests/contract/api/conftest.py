@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from l3ps_cli.main import app
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import QUEUES, STOP_WORKER, TRAINER_QUEUES, WORKER, Stack, StackOptions, free_port
-from l3ps_platform.catalog import Catalog
+from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.objects import ObjectStore, open_store
 from l3ps_platform.settings import Settings
@@ -164,7 +164,7 @@ def _ready(url: str) -> bool:
 
 @contextmanager
 def _looked_into(settings: Settings) -> Iterator[Service]:
-    catalog = Catalog(settings.catalog_url)
+    catalog = Catalog(settings.catalog_url).scoped(DEFAULT_PROJECT)
     with httpx.Client(base_url=settings.api_url, timeout=30) as http:
         yield Service(http, catalog, open_store(settings), settings)
     catalog.dispose()

@@ -11,7 +11,16 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 import pytest
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Base, Catalog, JobRow, StageMessage, StageRow, Transaction
+from l3ps_platform.catalog import (
+    DEFAULT_PROJECT,
+    Base,
+    Catalog,
+    JobRow,
+    ProjectRow,
+    StageMessage,
+    StageRow,
+    Transaction,
+)
 from l3ps_platform.catalog import jobs as catalog_jobs
 from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.catalog.migrate import upgrade
@@ -106,11 +115,12 @@ def sent() -> list[StageMessage]:
 
 @pytest.fixture
 def catalog(migrated_url: str, sent: list[StageMessage]) -> Iterator[Catalog]:
-    """An empty catalog of each kind whose messages land in ``sent``."""
-    made = Catalog(migrated_url, sent.extend)
+    """An empty catalog of each kind, as the default project sees it, whose messages land in ``sent``."""
+    made = Catalog(migrated_url, sent.extend).scoped(DEFAULT_PROJECT)
     with made.transaction() as tx:
         for table in reversed(Base.metadata.sorted_tables):
             tx.session.execute(table.delete())
+        tx.session.add(ProjectRow(id=DEFAULT_PROJECT, name="default", created_at=tx.now))
     yield made
     made.dispose()
 

@@ -11,6 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from l3ps.errors import DriveLogError, ModelError, Problem
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
+    DEFAULT_PROJECT,
     Base,
     Catalog,
     DriveState,
@@ -75,7 +76,7 @@ def test_a_queue_that_is_away_does_not_undo_the_commit(catalog: Catalog) -> None
     def away(_: object) -> None:
         raise OSError("no queue")
 
-    lonely = Catalog(catalog.url, away)
+    lonely = Catalog(catalog.url, away).scoped(DEFAULT_PROJECT)
     with lonely.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="k")
     lonely.dispose()

@@ -6,6 +6,7 @@ import pytest
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
+    DEFAULT_PROJECT,
     Catalog,
     DriveState,
     JobState,
@@ -176,7 +177,7 @@ def test_a_dead_redis_is_said_so_and_the_row_stays_queued(catalog: Catalog, play
     for call in (queue.ping, queue.depth, lambda: queue.send([message])):
         with pytest.raises(QueueUnavailable, match="does not answer"):
             call()
-    offline = Catalog(catalog.url, queue.send)
+    offline = Catalog(catalog.url, queue.send).scoped(DEFAULT_PROJECT)
     drive, model = play.drive(1), play.model()
     with offline.transaction() as tx:
         job = workflow.submit_job(tx, drive_id=drive, model=model)

@@ -24,6 +24,7 @@ from onnx import TensorProto, helper, numpy_helper
 from l3ps.simulate import simulate_drive
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
+    DEFAULT_PROJECT,
     Catalog,
     DriveRow,
     JobRow,
@@ -116,7 +117,7 @@ class Bench:
     """The service without an API: uploads straight into the store, jobs straight into the catalog."""
 
     def __init__(self, settings: Settings, store: ObjectStore, catalog: Catalog) -> None:
-        self.settings, self.store, self.catalog = settings, store, catalog
+        self.settings, self.store, self.catalog = settings, store, catalog.scoped(DEFAULT_PROJECT)
 
     def upload_drive(self, archive: Path, **given: str) -> str:
         key = f"uploads/{tempfile.mktemp(dir='').strip('/')}/{archive.name}"

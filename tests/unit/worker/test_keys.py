@@ -13,19 +13,27 @@ BEST = PRESETS["best"]
 
 
 def segment(**changes) -> str:
-    given = {"drive_sha256": "d", "model_sha256": "m", "scene": "s", "preset": BEST, "look": FAST} | changes
+    given = {
+        "project": "prj_a",
+        "drive_sha256": "d",
+        "model_sha256": "m",
+        "scene": "s",
+        "preset": BEST,
+        "look": FAST,
+    } | changes
     skip = given.pop("skip", False)
     return keys.segment_key(**given, skip=skip)
 
 
 def refine(**changes) -> str:
-    given = {"primal_key": "p", "preset": BEST, "formats": ["nuscenes"], "protocol": "nuscenes"} | changes
+    given = {"primal_key": "stages/prj_a/p", "preset": BEST, "formats": ["nuscenes"], "protocol": "nuscenes"} | changes
     return keys.refine_key(**given)
 
 
 @pytest.mark.parametrize(
     "change",
     [
+        {"project": "prj_b"},
         {"drive_sha256": "x"},
         {"model_sha256": "x"},
         {"scene": "x"},
@@ -47,7 +55,8 @@ def test_primal_labels_serve_every_refinement() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"primal_key": "x"},
+        {"primal_key": "stages/prj_a/x"},
+        {"primal_key": "stages/prj_b/p"},
         {"preset": replace(BEST, instance_class=False)},
         {"formats": ["semantickitti"]},
         {"protocol": "paper"},

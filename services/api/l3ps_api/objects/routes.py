@@ -6,13 +6,13 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
 
 from l3ps_api.objects import service
-from l3ps_api.services import ServicesDep
+from l3ps_api.services import SystemDep
 
 router = APIRouter(prefix="/v1/objects", tags=["objects"])
 
 
 @router.put("/{key:path}", status_code=200, response_class=Response)
-async def put_object(key: str, request: Request, services: ServicesDep) -> Response:
+async def put_object(key: str, request: Request, services: SystemDep) -> Response:
     """Store the body as the object or part that the URL's signature permits; the answer's ETag names a part."""
     grant = service.grant(services, "PUT", key, request.query_params)
     etag = await service.receive(services, grant, request.headers.get("content-length"), request.stream())
@@ -21,6 +21,6 @@ async def put_object(key: str, request: Request, services: ServicesDep) -> Respo
 
 @router.head("/{key:path}", response_class=FileResponse, include_in_schema=False)
 @router.get("/{key:path}", response_class=FileResponse)
-def get_object(key: str, request: Request, services: ServicesDep) -> FileResponse:
+def get_object(key: str, request: Request, services: SystemDep) -> FileResponse:
     """Send the object that the URL's signature permits; `Range` is honoured."""
     return service.send(services, service.grant(services, request.method, key, request.query_params))

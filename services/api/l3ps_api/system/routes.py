@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from pydantic import BaseModel, Field
 
-from l3ps_api.services import ServicesDep
+from l3ps_api.services import SystemDep
 from l3ps_api.system.checks import check_all
 
 router = APIRouter(tags=["system"])
@@ -28,7 +28,7 @@ async def healthz() -> Health:
 
 
 @router.get("/readyz")
-def readyz(services: ServicesDep) -> Readiness:
+def readyz(services: SystemDep) -> Readiness:
     """Whether catalog, object store and queue answer; 503 names those that do not."""
     return Readiness(checks=check_all(services))
 

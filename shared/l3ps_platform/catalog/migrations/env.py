@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from l3ps_platform.catalog.models import Base
+from l3ps_platform.catalog import Base
 
 context.configure(
     connection=context.config.attributes["connection"],
