@@ -22,7 +22,7 @@ hostile: servers ## every hostile upload on both stacks, a million empty files a
 lint: setup-dev
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
-	$(RUN) mypy shared/l3ps shared/l3ps_cluster shared/l3ps_platform services/*/l3ps_*
+	$(RUN) mypy shared/l3ps shared/l3ps_client shared/l3ps_cluster shared/l3ps_platform services/*/l3ps_*
 	$(RUN) lint-imports
 
 format: setup-dev ## put the code into the house style
