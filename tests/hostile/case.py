@@ -1,10 +1,14 @@
 """What a hostile upload is, and what must become of it."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from .samples import Samples
+
+FULL = "L3PS_HOSTILE" in os.environ
+"""Whether this is ``make hostile``: every case on both stacks, with the limits as they ship."""
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,33 @@
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
 ``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
-``figures`` (sums for the metrics). What changes states is in :mod:`l3ps_platform.workflow`.
+``figures`` (sums for the metrics), ``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``,
+``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``. What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, rules, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    bundles,
+    drives,
+    events,
+    figures,
+    jobs,
+    keys,
+    projects,
+    quotas,
+    requests,
+    rules,
+    stages,
+    trainings,
+    uploads,
+    webhooks,
+)
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
+from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
+from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
+from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -24,6 +46,7 @@ from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transac
 from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -37,19 +60,28 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
     "ArrivalRow",
+    "AttemptRow",
     "Base",
     "Catalog",
+    "DeliveryRow",
+    "DeliveryState",
     "DriveRow",
     "DriveState",
+    "EventKind",
+    "EventRow",
     "JobRow",
     "JobState",
     "Json",
+    "ModelFiguresRow",
     "ModelRow",
     "ModelState",
+    "Outcome",
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
     "RuleRow",
     "SceneRow",
     "Sender",
@@ -62,13 +94,20 @@ __all__ = [
     "Transaction",
     "UploadRow",
     "UploadState",
+    "WebhookRow",
     "annotation_sets",
     "bundles",
     "drives",
+    "events",
     "figures",
     "jobs",
+    "keys",
+    "projects",
+    "quotas",
+    "requests",
     "rules",
     "stages",
     "trainings",
     "uploads",
+    "webhooks",
 ]
