@@ -7,8 +7,10 @@ from typing import Literal
 
 from .samples import Samples
 
-FULL = "L3PS_HOSTILE" in os.environ
-"""Whether this is ``make hostile``: every case on both stacks, with the limits as they ship."""
+ONLY = os.environ.get("L3PS_HOSTILE", "")
+"""In ``make hostile`` a regular expression of names of cases."""
+FULL = bool(ONLY)
+"""Whether this is ``make hostile``: every such case on both stacks, with the limits as they ship."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
 def service(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """The service as ``l3ps up`` runs it, and on PostgreSQL, MinIO and a Redis server; not the one of other tests."""
     data = tmp_path_factory.mktemp("hostile")
-    start = api._embedded if request.param == "embedded" else partial(api._servers, redis_database=2)
+    embedded, servers = partial(api._embedded, training=False), partial(api._servers, redis_database=2)
+    start = embedded if request.param == "embedded" else servers
     with pytest.MonkeyPatch.context() as patch:
         for name, value in LIMITS.items():
             patch.setenv(name, value)

@@ -130,11 +130,11 @@ def service(request, tmp_path_factory) -> Iterator[Service]:
 
 
 @contextmanager
-def _embedded(request, data) -> Iterator[Settings]:
+def _embedded(request, data, training: bool = True) -> Iterator[Settings]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in TUNING.items():
             patch.setenv(name, value)
-        with Stack(StackOptions(data, port=0, training=True)) as stack:
+        with Stack(StackOptions(data, port=0, training=training)) as stack:
             yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]), token=stack.token)
 
 

@@ -67,7 +67,9 @@ def _api(api_process: Callable, redis_server: str, tmp_path_factory: pytest.Temp
     places = [f"s3://minio:{SECRET}@127.0.0.1:{port}/fleet/logs?secure=0"]
     places.append(f"s3://minio:{SECRET}@127.0.0.1:{port}/private?secure=0&project=prj_somebody")
     redis_url = redis_server.removesuffix("/0") + "/5"
-    url = api_process(data_dir=str(data), token=TOKEN, sources=json.dumps(places), redis_url=redis_url)
+    url = api_process(
+        data_dir=str(data), token=TOKEN, sources=json.dumps(places), redis_url=redis_url, reconcile_seconds="1"
+    )
     catalog = Catalog(f"sqlite:///{data / 'catalog.db'}").scoped(DEFAULT_PROJECT)
     with catalog.transaction() as tx:
         workflow.accept_model(tx, name="m", filename="m.zip", size=1, object_key="uploads/m/m.zip")
