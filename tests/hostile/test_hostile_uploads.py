@@ -1,7 +1,7 @@
 """Uploads made to do harm: each is refused with a problem that says what to do, and nothing of it stays.
 
 All go through the real API to a real worker, which takes them one after the other. ``make hostile`` runs every case on
-both stacks; without it one stack takes every third.
+both stacks; without it one stack takes every third, and fewer models.
 """
 
 import re
@@ -35,7 +35,7 @@ def chosen() -> list[Case]:
     """The cases to run."""
     if FULL:
         return [case for case in ALL if re.search(ONLY, case.name)]
-    return ALL[::3]
+    return ALL[: -len(cases_models.CASES) : 3] + cases_models.CASES[::8]  # a trial of a model takes a second
 
 
 @dataclass
