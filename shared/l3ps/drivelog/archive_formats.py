@@ -97,8 +97,8 @@ def zip_members(file: BinaryIO, size: int, max_files: int) -> Iterator[Member]:
     Raises:
         ArchiveFault: encrypted, a link or device, an unknown compression, truncated or corrupt.
     """
-    if _zip_entries(file, size, max_files) > max_files:
-        raise ArchiveFault("too-many-files", f"it has more than {max_files} members")
+    if _zip_entries(file, size, max_files) >= max_files:  # the folder they go to counts as well
+        raise ArchiveFault("too-many-files", f"it has more than {max_files} files and folders")
     try:
         archive = zipfile.ZipFile(file)
     except (*_ZIP_DAMAGE, OSError) as error:
