@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
+.PHONY: help demo test chaos bench-scaling bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -15,6 +15,12 @@ demo: setup ## label a simulated drive through the service; DRIVE=log MODEL=bund
 
 test: lint servers ## style, types, import rules and every test
 	$(RUN) pytest
+
+chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
+	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
+
+bench-scaling: servers ## the same scenes with one worker and with two, one thread each
+	$(RUN) python tests/load/scaling.py
 
 lint: setup-dev
 	$(RUN) ruff check .
@@ -66,4 +72,4 @@ demo-model: setup-dev ## train the demo's model again, from thirty simulated ima
 	cp demo-model/bundle/model.* demo-model/bundle/report.* services/cli/l3ps_cli/models/demo/
 
 clean: ## remove what the targets made here
-	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train chaos-report.*
