@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -157,17 +158,17 @@ def test_disk_full(scenario, ends_well, small_disk: Path) -> None:
     service.begin()
     service.start_worker(concurrency=2)
     service.at_work("segment")
-    ballast = small_disk / "ballast"
-    with ballast.open("wb") as file:
-        try:
-            while True:
-                file.write(b"x" * (1 << 16))
-                file.flush()
-        except OSError:
-            pass
-    full = StageRow.error["cause"].as_string() == "disk-full"
-    wait_until(lambda: service.stages(full), "nobody met the full disk", 60)
+    ballast = (small_disk / "ballast").open("ab", buffering=0)
+
+    def met() -> bool:
+        with suppress(OSError):
+            while True:  # also what the workers free
+                ballast.write(b"x" * (1 << 14))
+        return bool(service.stages(StageRow.error["cause"].as_string() == "disk-full"))
+
+    wait_until(met, "nobody met the full disk", 60)
     outlast(3.0)
-    ballast.unlink()
+    ballast.close()
+    (small_disk / "ballast").unlink()
     ends_well(service)
     assert scenario.facts["failures counted"] == 0
