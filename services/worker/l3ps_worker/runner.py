@@ -142,6 +142,7 @@ def _cost(book: CostBook, done: Done | None) -> workflow.Cost:
         peak_mb=peak,
         scans=done.scans if done else 0,
         points=done.points if done else 0,
+        bytes=done.bytes if done else 0,
         cached=done.cached if done else False,
         steps=steps,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from sqlalchemy import ForeignKey, Index, String, UniqueConstraint
+from sqlalchemy import ForeignKey, Index, String, UniqueConstraint, text
 from sqlalchemy.orm import Mapped, mapped_column
 
 from l3ps_platform.catalog.base import Base, Json, Owned
@@ -30,6 +30,7 @@ class ProjectRow(Base):
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str] = mapped_column(String(200), unique=True)
     created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
 
 
 class UploadRow(Owned, Base):
@@ -116,6 +117,9 @@ class AnnotationsRow(Owned, Base):
     deleted_at: Mapped[datetime | None]
 
 
+_JUDGED = text("quality IS NOT NULL")
+
+
 class JobRow(Owned, Base):
     """One labelling of one drive with one model.
 
@@ -126,7 +130,15 @@ class JobRow(Owned, Base):
 
     __tablename__ = "jobs"
     noun = "job"
-    __table_args__ = (Index(None, "state"), Index(None, "drive_id"), Index(None, "project_id", "id"))
+    __table_args__ = (
+        Index(None, "state"),
+        Index(None, "project_id", "id"),
+        Index(None, "project_id", "state", "id"),
+        Index(None, "drive_id", "id"),
+        Index(None, "model_id", "id"),
+        # Logs with truth are few; the metrics want the latest of their jobs.
+        Index("ix_jobs_with_quality", "id", sqlite_where=_JUDGED, postgresql_where=_JUDGED),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     drive_id: Mapped[str] = mapped_column(ForeignKey("drives.id"))
@@ -200,8 +212,11 @@ class StageRow(Base):
     __tablename__ = "stages"
     __table_args__ = (
         Index(None, "state", "lease_until"),
+        Index(None, "state", "name", "queued_at"),
         Index(None, "job_id"),
         Index(None, "scene_id"),
+        Index(None, "drive_id"),
+        Index(None, "model_id"),
         Index(None, "training_id"),
     )
 

@@ -25,6 +25,12 @@ def of_job(session: Session, job_id: str) -> list[StageRow]:
     return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
 
 
+def of_job_and_drive(session: Session, job_id: str, drive_id: str) -> list[StageRow]:
+    """The stages that a job's client sees: the check of its drive, and :func:`of_job`."""
+    seen = or_(StageRow.job_id == job_id, StageRow.drive_id == drive_id)
+    return list(session.scalars(select(StageRow).where(seen).order_by(StageRow.id)))
+
+
 def of_scene(session: Session, scene_id: str) -> list[StageRow]:
     """The stages of one scene, in order."""
     return list(session.scalars(select(StageRow).where(StageRow.scene_id == scene_id).order_by(StageRow.id)))

@@ -11,12 +11,15 @@ from sqlalchemy import delete, select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import notices
+from l3ps_platform.workflow.attempts import note_again, note_end, note_figures
 from l3ps_platform.workflow.causes import Cause, failure, stored_cause
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
@@ -32,6 +35,7 @@ class Cost:
         cpu_seconds: processor time of the process, all threads.
         peak_mb: peak resident memory, MB.
         scans, points: what was processed.
+        bytes: what an ingest took in and other stages stored.
         cached: the output was there already and nothing was computed.
         steps: (seconds, peak MB) of each step inside the stage.
     """
@@ -41,6 +45,7 @@ class Cost:
     peak_mb: float = 0.0
     scans: int = 0
     points: int = 0
+    bytes: int = 0
     cached: bool = False
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -70,7 +75,13 @@ class Retry:
 
 
 def complete(
-    tx: Transaction, claim: Claim, cost: Cost, *, output_key: str | None = None, quality: Json | None = None
+    tx: Transaction,
+    claim: Claim,
+    cost: Cost,
+    *,
+    output_key: str | None = None,
+    quality: Json | None = None,
+    estimates: Json | None = None,
 ) -> None:
     """A segment, refine or publish stage is done: record it and enqueue what follows.
 
@@ -80,6 +91,7 @@ def complete(
         cost: what it cost.
         output_key: where its output lies.
         quality: for a refine stage the scene's, for a publish stage the job's.
+        estimates: for a publish stage what can be told of the job's labels without truth.
 
     Raises:
         LeaseLost: the stage is no longer ours; nothing was changed.
@@ -88,6 +100,7 @@ def complete(
     job = jobs.lock(tx.session, _must(stage.job_id))
     if stage.name is StageName.PUBLISH:
         job.quality = quality
+        note_figures(tx, job, quality, estimates)
     elif stage.scene_id is not None:
         scene = tx.session.get_one(SceneRow, stage.scene_id)
         if quality is not None:
@@ -97,6 +110,7 @@ def complete(
             enqueue(tx, waiting[0])
         elif not waiting:
             scene.state = StageState.DONE
+            notices.of_scene(tx, job, scene, stage)
     settle_job(tx, job)
 
 
@@ -118,6 +132,7 @@ def drive_checked(
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     drive.sha256, drive.format, drive.info = sha256, format, info
     tx.session.flush()
+    notices.of_upload(tx, drive)
     _plan_waiting(tx, drive_id=drive.id)
 
 
@@ -137,6 +152,7 @@ def model_checked(
     model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     model.sha256, model.info = sha256, info
     tx.session.flush()
+    notices.of_upload(tx, model)
     _plan_waiting(tx, model_id=model.id)
 
 
@@ -155,17 +171,26 @@ def fail(tx: Transaction, claim: Claim, error: Json, *, retry: Retry | None = No
     failed(tx, finish(tx, claim, StageState.FAILED, cost=cost, error=error), retry)
 
 
-def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
-    """The consequences of a failed attempt whose row says so already, with its error."""
+def failed(tx: Transaction, stage: StageRow, retry: Retry | None, again: Outcome = Outcome.RETRIED) -> None:
+    """The consequences of a failed attempt whose row says so already, with its error.
+
+    Args:
+        tx: the transaction.
+        stage: the stage.
+        retry: how often and how long it may be tried; None for not again.
+        again: what the attempt is remembered as if another one follows.
+    """
     parent = lock_parents(tx, stage)
     if parent is not None and parent.cancel_requested:
         stage.state, stage.error = StageState.CANCELLED, failure(_WAS_CANCELLED, Cause.CANCELLED)
         cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
         settle(tx, parent)
     elif retry is not None and (moment := _next_try(tx, stage, retry)) is not None:
+        note_again(tx, stage, again)
         stage.state, stage.not_before, stage.finished_at = StageState.WAITING, moment, None
         stage.attempt += 1
         tx.session.flush()
+        notices.of_retry(tx, parent, stage)
     elif parent is not None:
         cancel_rest_of_scene(tx, stage, StageState.FAILED)
         settle(tx, parent)
@@ -248,6 +273,7 @@ def finish(
         values["fraction"] = 1.0
     if not changed(tx, update(StageRow).where(*owned(claim)).values(**values)):
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+    note_end(tx, stage, _OUTCOMES[state], cost=cost, error=error)
     if cost is not None:
         tx.session.execute(delete(StepRow).where(StepRow.stage_id == claim.stage_id))
         for name, (seconds, peak_mb) in cost.steps.items():
@@ -255,6 +281,15 @@ def finish(
     tx.session.flush()
     tx.session.refresh(stage)
     return stage
+
+
+_OUTCOMES = {
+    StageState.DONE: Outcome.DONE,
+    StageState.FAILED: Outcome.FAILED,
+    StageState.QUEUED: Outcome.RELEASED,
+    StageState.CANCELLED: Outcome.CANCELLED,
+}
+"""What the end of an attempt is called that left its stage in this state."""
 
 
 def _next_try(tx: Transaction, stage: StageRow, retry: Retry) -> datetime | None:
@@ -297,9 +332,11 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept
+        notices.of_upload(tx, drive)
     if stage.model_id is not None:
         model = bundles.lock(tx.session, stage.model_id)
         model.state, model.problem = ModelState.REJECTED, kept
+        notices.of_upload(tx, model)
     tx.session.flush()
     _plan_waiting(tx, drive_id=stage.drive_id, model_id=stage.model_id)
 

@@ -13,6 +13,7 @@ from l3ps_platform.catalog.session import StageMessage, Transaction
 from l3ps_platform.catalog.states import QUEUE_OF, DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import NotFound
 from l3ps_platform.ids import new_id
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.causes import cause_of, failure
 
 
@@ -86,6 +87,7 @@ def submit_job(
         raise refusal
     tx.session.add(job)
     tx.session.flush()
+    notices.of_parent(tx, job)
     plan_if_ready(tx, job, drive, bundle)
     return job
 
@@ -100,6 +102,7 @@ def plan_if_ready(tx: Transaction, job: JobRow, drive: DriveRow, model: ModelRow
         job.state = JobState.FAILED
         job.error = error_json(refusal)
         job.finished_at = tx.now
+        notices.of_parent(tx, job)
         return
     if drive.state is not DriveState.READY or model.state is not ModelState.READY:
         return

@@ -17,12 +17,14 @@ import structlog
 from sqlalchemy import select, update
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
 from l3ps_platform.catalog.states import QueueName, StageState, UploadState
 from l3ps_platform.errors import CatalogUnavailable, Conflict, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
@@ -213,6 +215,7 @@ def lease_lost(
     values = {"state": StageState.FAILED, "lease_owner": None, "lease_until": None, "finished_at": tx.now}
     if not changed(tx, update(StageRow).where(*conditions).values(**values, error=error)):
         return False
+    note_end(tx, stage, Outcome.FAILED, error=error)
     tx.session.refresh(stage)
-    failed(tx, stage, retry)
+    failed(tx, stage, retry, Outcome.LOST)
     return True

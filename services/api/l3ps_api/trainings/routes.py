@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_api.trainings import service
 from l3ps_api.trainings.schemas import Training, TrainingPage, TrainingRequest
 from l3ps_platform.catalog import JobState
@@ -26,7 +26,7 @@ def train_model(request: TrainingRequest, response: Response, services: Services
 def list_trainings(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("trn")] = None,
     state: Annotated[JobState | None, Query(description="Only trainings in this state.")] = None,
 ) -> TrainingPage:
     """Trainings, newest first."""

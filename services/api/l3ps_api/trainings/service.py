@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from sqlalchemy.orm import Session
 
-from l3ps_api.jobs.service import stage_document
+from l3ps_api.jobs.service import check_active_jobs, stage_document
 from l3ps_api.problems import ApiProblem, conflict, invalid
 from l3ps_api.services import Services
 from l3ps_api.trainings.schemas import (
@@ -43,6 +43,7 @@ def create(services: Services, request: TrainingRequest) -> Training:
         settings["validation"] = measured
     try:
         with services.catalog.transaction() as tx:
+            check_active_jobs(services, tx.session)
             annotations_id = _annotations(tx.session, "annotations", request.annotations)
             validation_id = _annotations(tx.session, "validation", measured) if isinstance(measured, str) else None
             row = submit_training(
