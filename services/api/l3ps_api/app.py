@@ -10,9 +10,10 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, ProcessCollector
 
 from l3ps_api import errors, problems
+from l3ps_api.access_log import AccessLog
 from l3ps_api.annotation_sets.routes import router as annotation_sets
 from l3ps_api.auth import authenticate
 from l3ps_api.drives.routes import router as drives
@@ -28,7 +29,7 @@ from l3ps_api.uploads.routes import router as uploads
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
-from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.metrics import CatalogCollector, DiskCollector
 from l3ps_platform.objects import open_store
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
@@ -62,6 +63,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.token = settings.token.get_secret_value() if settings.token else None
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
+    app.state.registry.register(DiskCollector(settings))
+    ProcessCollector(registry=app.state.registry)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -76,6 +79,7 @@ def create_app(settings: Settings) -> FastAPI:
     if not loopback and app.state.token is None:
         log.warning("anyone who reaches this address may use the service: set L3PS_TOKEN", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
+    app.add_middleware(AccessLog)
     problems.describe_in_openapi(app)
     return app
 
