@@ -5,7 +5,8 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hostile bench bench-train lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
+.PHONY: help demo test hostile bench bench-train load lint format setup setup-dev setup-trainer servers
+.PHONY: compose-check compose-chaos demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -56,6 +57,9 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 	  { echo 'Name all three: make bench-train IMAGES=folder BACKBONE=spec VALIDATION=folder' >&2; exit 2; }
 	$(RUN) l3ps train "$(IMAGES)" --backbone "$(BACKBONE)" --validation "$(VALIDATION)" --fresh --out bench-train \
 	  $(if $(CLASSES),--classes "$(CLASSES)") $(if $(COUNT),--images $(COUNT))
+
+load: servers ## 200 clients read their job's status for 3 minutes while two workers are busy; writes load-report.json
+	$(RUN) python tests/load/status.py
 
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py

@@ -10,9 +10,10 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, ProcessCollector
 
 from l3ps_api import errors
+from l3ps_api.access_log import AccessLog
 from l3ps_api.annotation_sets.routes import router as annotation_sets
 from l3ps_api.auth import Gate, authenticate
 from l3ps_api.description import describe
@@ -40,7 +41,7 @@ from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
-from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.metrics import CatalogCollector, DiskCollector
 from l3ps_platform.objects import open_store
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
@@ -79,6 +80,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.events = EventHub(catalog)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
+    app.state.registry.register(DiskCollector(settings))
+    ProcessCollector(registry=app.state.registry)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -99,6 +102,7 @@ def create_app(settings: Settings) -> FastAPI:
     if not settings.loopback and settings.token is None:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
+    app.add_middleware(AccessLog)
     describe(app)
     return app
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 
+import structlog
 from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
@@ -14,6 +15,8 @@ from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
 from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
+
+log = structlog.get_logger(__name__)
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -37,6 +40,7 @@ def create(services: Services, request: JobRequest) -> Job:
         )
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
+    log.info("job accepted", job=job.id, drive=job.drive_id, model=job.model_id)
     return get(services, job.id)
 
 
