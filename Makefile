@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hostile bench bench-train load lint format setup setup-dev setup-trainer servers
+.PHONY: help demo test hostile chaos bench bench-train bench-scaling load lint format setup setup-dev setup-trainer servers
 .PHONY: compose-check compose-chaos demo-model clean
 
 help: ## this list
@@ -19,6 +19,12 @@ test: lint servers ## style, types, import rules and every test
 
 hostile: servers ## every hostile upload on both stacks, a million empty files among them: 20 minutes, 2 GB of disk
 	L3PS_HOSTILE=1 $(RUN) pytest tests/hostile --timeout 3600
+
+chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
+	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
+
+bench-scaling: servers ## the same scenes with one worker and with two, one thread each
+	$(RUN) python tests/load/scaling.py
 
 lint: setup-dev
 	$(RUN) ruff check .
@@ -76,4 +82,4 @@ demo-model: setup-dev ## train the demo's model again, from thirty simulated ima
 	cp demo-model/bundle/model.* demo-model/bundle/report.* services/cli/l3ps_cli/models/demo/
 
 clean: ## remove what the targets made here
-	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train chaos-report.*

@@ -108,8 +108,10 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
     retry = workflow.Retry.of(settings)
     with _briefly() as tx:
         for stage_id, owner in stages.owned(tx.session, owner_prefix(_main_pid)):
-            # Given back before the child died, the stage may be in the hands of another one by now.
-            if stage_id == args[0] and not is_child(int(owner.rpartition(":")[2]), _main_pid):
+            # Given back before the child died, the stage may be in the hands of another one by now. A child beyond
+            # the time limit is reported first and then killed.
+            dead = isinstance(exception, TimeLimitExceeded) or not is_child(int(owner.rpartition(":")[2]), _main_pid)
+            if stage_id == args[0] and dead:
                 workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner, reason=reason, cause=cause)
 
 

@@ -15,7 +15,7 @@ from l3ps.progress import Progress
 from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
-from l3ps_platform.errors import ObjectMissing
+from l3ps_platform.errors import ObjectMissing, StoreUnavailable
 from l3ps_platform.settings import Settings
 from l3ps_worker.context import Context
 
@@ -111,7 +111,7 @@ def unpacked(context: Context, drive: DriveRow, progress: Progress) -> Iterator[
     def make(target: Path) -> None:
         with context.scratch.workdir() as folder:
             archive = folder / "archive"
-            download(context, drive.object_key, archive, drive.size, progress)
+            _as_checked(download(context, drive.object_key, archive, drive.size, progress), drive.sha256)
             unpack(archive, target, unpack_limits(context.settings), name=drive.filename, progress=progress)
 
     with context.scratch.entry(f"drive-{drive.sha256}", make) as root:
@@ -124,7 +124,7 @@ def model_file(context: Context, model: ModelRow, progress: Progress) -> Iterato
     assert model.sha256 is not None
 
     def make(target: Path) -> None:
-        download(context, model.object_key, target, model.size, progress)
+        _as_checked(download(context, model.object_key, target, model.size, progress), model.sha256)
 
     with context.scratch.entry(f"model-{model.sha256}", make) as path:
         yield path
@@ -146,6 +146,12 @@ def download(context: Context, key: str | None, path: Path, size: int, progress:
     except ObjectMissing:
         raise ProcessingError("the uploaded archive is no longer in the store: upload it again") from None
     return digest.hexdigest()
+
+
+def _as_checked(found: str, known: str | None) -> None:
+    """StoreUnavailable for an object that was checked and now reads otherwise: that is no fault of the upload."""
+    if found != known:
+        raise StoreUnavailable(f"the object store gave other bytes than were checked: sha256 {found[:12]}…")
 
 
 def check_sha256(claimed: str | None, found: str, filename: str) -> None:
