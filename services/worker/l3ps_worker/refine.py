@@ -27,6 +27,7 @@ from l3ps_platform.objects import segment as key_segment
 from l3ps_worker.arrays import read_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import refine_key
+from l3ps_worker.outputs import pin
 from l3ps_worker.segment import primal_key
 from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work
 
@@ -44,6 +45,7 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     wanted = work.job.settings
     prefix = refine_key(primal_key(work), work.preset, wanted["formats"], wanted["protocol"], max_points)
     manifest_key = f"{prefix}/{SCENE_MANIFEST}"
+    pin(context, claim, prefix, progress)
     try:
         stored: Json = json.loads(context.store.get_bytes(manifest_key))
         return _done(manifest_key, stored, work, cached=True)
@@ -96,6 +98,7 @@ def _done(
 
     def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
         workflow.complete(tx, claim, cost, output_key=key, quality=quality)
+        workflow.note_output(tx, key.rpartition("/")[0], sum(file["size"] for file in manifest["files"]))
 
     return Done(finish, work.scene.scans, work.scene.points, cached=cached, steps=steps or {})
 

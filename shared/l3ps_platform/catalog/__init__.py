@@ -1,11 +1,24 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``outputs``, ``retention``,
+``belongings`` (whose an object is), ``figures`` (sums for the metrics). What changes states is in
+:mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    belongings,
+    bundles,
+    drives,
+    figures,
+    jobs,
+    outputs,
+    retention,
+    stages,
+    trainings,
+    uploads,
+)
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
@@ -20,12 +33,14 @@ from l3ps_platform.catalog.models import (
     TrainingRow,
     UploadRow,
 )
+from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, RetentionRow
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -45,9 +60,13 @@ __all__ = [
     "Json",
     "ModelRow",
     "ModelState",
+    "OutputRow",
+    "OutputState",
+    "OutputUseRow",
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RetentionRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -60,10 +79,13 @@ __all__ = [
     "UploadRow",
     "UploadState",
     "annotation_sets",
+    "belongings",
     "bundles",
     "drives",
     "figures",
     "jobs",
+    "outputs",
+    "retention",
     "stages",
     "trainings",
     "uploads",

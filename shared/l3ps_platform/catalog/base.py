@@ -14,6 +14,7 @@ from l3ps_platform.catalog.states import (
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -74,6 +75,7 @@ class Base(DeclarativeBase):
         JobState: _states(JobState),
         StageState: _states(StageState),
         StageName: _states(StageName),
+        OutputState: _states(OutputState),
         QueueName: _states(QueueName),
     }
 

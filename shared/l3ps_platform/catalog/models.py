@@ -45,6 +45,7 @@ class UploadRow(Owned, Base):
     size: Mapped[int]
     sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
     parts: Mapped[int]
+    part_size: Mapped[int]  # of every part but the last; 0 in rows of before this was kept
     state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
     object_key: Mapped[str]
     s3_upload_id: Mapped[str]
@@ -95,8 +96,9 @@ class ModelRow(Owned, Base):
     state: Mapped[ModelState] = mapped_column(default=ModelState.UPLOADED)
     problem: Mapped[Json | None]
     info: Mapped[Json | None]
-    object_key: Mapped[str | None]
+    object_key: Mapped[str | None]  # None once the archive is deleted
     created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
 
 
 class AnnotationsRow(Owned, Base):
@@ -126,7 +128,12 @@ class JobRow(Owned, Base):
 
     __tablename__ = "jobs"
     noun = "job"
-    __table_args__ = (Index(None, "state"), Index(None, "drive_id"), Index(None, "project_id", "id"))
+    __table_args__ = (
+        Index(None, "state"),
+        Index(None, "drive_id"),
+        Index(None, "project_id", "id"),
+        Index(None, "deleted_at"),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     drive_id: Mapped[str] = mapped_column(ForeignKey("drives.id"))
@@ -139,6 +146,8 @@ class JobRow(Owned, Base):
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]  # its labels are deleted; the row stays for the figures
+    swept_at: Mapped[datetime | None]  # and when they had left the store
 
 
 class TrainingRow(Owned, Base):

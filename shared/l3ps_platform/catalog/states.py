@@ -66,6 +66,13 @@ class StageState(StrEnum):
         return self in (StageState.DONE, StageState.FAILED, StageState.CANCELLED)
 
 
+class OutputState(StrEnum):
+    """A stage output's life; a doomed one is being deleted."""
+
+    LIVE = "live"
+    DOOMED = "doomed"
+
+
 class StageName(StrEnum):
     """What a stage does."""
 
