@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, StageRow, TrainingRow
 from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow
-from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.session import Transaction, project_of
 from l3ps_platform.catalog.states import ACTIVE, OutputState, StageName
 
 MAIN = {StageName.SEGMENT: "primal.npz", StageName.REFINE: "scene.json", StageName.TRAIN: "bundle.zip"}
@@ -85,8 +85,9 @@ def erase(tx: Transaction, key: str) -> None:
     tx.session.execute(sql_delete(OutputRow).where(*gone), execution_options={"synchronize_session": False})
 
 
-def stored_bytes(session: Session, project_id: str) -> int:
-    """Bytes of a project's outputs and drive archives."""
+def stored_bytes(session: Session, project_id: str | None = None) -> int:
+    """Bytes of a project's outputs and drive archives; the project is the session's where none is given."""
+    project_id = project_of(session, project_id)
     outputs = select(func.coalesce(func.sum(OutputRow.bytes), 0)).where(
         OutputRow.project_id == project_id, OutputRow.state == OutputState.LIVE
     )

@@ -43,3 +43,9 @@ def get_job(job_id: str, services: ServicesDep) -> Job:
 def cancel_job(job_id: str, services: ServicesDep) -> Job:
     """Ask a job to stop; what runs stops at its next scan. Refused when the job is over."""
     return service.cancel(services, job_id)
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: str, services: ServicesDep) -> None:
+    """Delete a finished job and its labels. Refused while it is not over; what other jobs share with it stays."""
+    service.delete(services, job_id)

@@ -69,13 +69,19 @@ def cancel(services: Services, job_id: str) -> Job:
     return get(services, job_id)
 
 
+def delete(services: Services, job_id: str) -> None:
+    """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
+    with services.catalog.transaction() as tx:
+        jobs.delete(tx, job_id)
+
+
 def _document(session: Session, job: JobRow) -> Job:
     planned = stages.of_job(session, job.id)
     ingest = stages.ingest_of(session, drive_id=job.drive_id)
     rows = [ingest, *planned] if ingest is not None else planned
     steps = stages.steps(session, [row.id for row in rows])
     drive = drives.many(session, [job.drive_id])[job.drive_id]
-    model = bundles.get(session, job.model_id)
+    model = bundles.many(session, [job.model_id])[job.model_id]
     done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:

@@ -21,3 +21,9 @@ def list_models(services: ServicesDep, limit: Limit = 50, cursor: Cursor = None)
 def get_model(model: str, services: ServicesDep) -> Model:
     """A model by its name or id."""
     return service.get(services, model)
+
+
+@router.delete("/{model}", status_code=204)
+def delete_model(model: str, services: ServicesDep) -> None:
+    """Delete a model, by its name or id, and free its name. Refused while a job uses it; labels made with it stay."""
+    service.delete(services, model)
