@@ -127,6 +127,10 @@ class Settings(BaseSettings):
     resend_seconds: float = 30.0
     # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
     cancel_seconds: float = 10.0
+    # How long what nothing refers to stays in the store: half-made objects of dead processes, checkpoints of trainings
+    # that failed. Long enough to look into a failure, and to go on with a training.
+    orphan_seconds: float = 24 * 3600.0
+    orphans_every_seconds: float = 3600.0  # how often the whole store is looked through for them
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis

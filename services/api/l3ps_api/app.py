@@ -32,6 +32,7 @@ from l3ps_api.models.routes import router as models
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.projects.routes import router as projects
+from l3ps_api.retention.routes import router as retention
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
@@ -55,7 +56,7 @@ Drive logs in, panoptic labels on every LiDAR point out.
 
 1. `POST /v1/uploads` announces an archive; `PUT` its parts to the URLs answered; `POST …/complete` makes it a drive.
 2. `POST /v1/jobs` labels a drive with a model; `GET /v1/jobs/{id}` shows progress, cost and quality.
-3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs.
+3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs; `…/labels.tar` is all of them in one.
 
 A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
 `GET /v1/trainings/{id}` shows progress, log and report.
@@ -85,7 +86,8 @@ def create_app(settings: Settings) -> FastAPI:
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings, events, webhooks, keys, projects):
+    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention)
+    for router in (*resources, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.

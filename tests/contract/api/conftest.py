@@ -85,6 +85,14 @@ class Service:
             time.sleep(0.1)
         return document
 
+    @staticmethod
+    def until(true: Callable[[], bool], seconds: float = 60) -> None:
+        """Wait for something to be true."""
+        deadline = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
     def wait_for_drive(self, drive_id: str) -> dict:
         """A drive once it has been checked."""
         return self.wait(f"/v1/drives/{drive_id}", lambda drive: drive["state"] in ("ready", "rejected"))

@@ -60,3 +60,9 @@ def cancel_job(job_id: str, services: ServicesDep) -> Job:
 def retry_job(job_id: str, services: ServicesDep) -> Job:
     """Run a failed or cancelled job again: only what is missing. Refused in every other state."""
     return service.retry(services, job_id)
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: str, services: ServicesDep) -> None:
+    """Delete a finished job and its labels. Refused while it is not over; what other jobs share with it stays."""
+    service.delete(services, job_id)

@@ -100,6 +100,12 @@ def retry(services: Services, job_id: str) -> Job:
     return get(services, job_id)
 
 
+def delete(services: Services, job_id: str) -> None:
+    """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
+    with services.catalog.transaction() as tx:
+        jobs.delete(tx, job_id)
+
+
 def _document(session: Session, job_id: str) -> Job:
     job, drive, model = jobs.with_inputs(session, job_id)
     rows = stages.of_job_and_drive(session, job.id, job.drive_id)
