@@ -56,6 +56,7 @@ class Settings(BaseSettings):
     A field's comment gives the measurement or the rule behind its default.
     """
 
+    # Values of settings hold secrets, so errors do not repeat them.
     model_config = SettingsConfigDict(env_prefix="L3PS_", extra="ignore", hide_input_in_errors=True)
 
     data_dir: Path = Field(default_factory=lambda: Path.home() / ".local" / "share" / "l3ps")
@@ -92,6 +93,9 @@ class Settings(BaseSettings):
     # takes seconds; one that takes longer and still lives cannot commit once another has taken over.
     idempotency_lease_seconds: float = Field(default=60.0, gt=0)
 
+    # Buckets that jobs may read from and never write to: a JSON list, or separated by commas, of
+    # s3://KEY:SECRET@host:port/bucket/prefix?secure=0&project=prj_… (l3ps_platform.objects.sources).
+    sources: SecretStr = SecretStr("")
     scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
     # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
     # recordings met here unpack to well under 1 GB per 40 keyframes with six cameras.

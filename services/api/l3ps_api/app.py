@@ -29,10 +29,12 @@ from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
 from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
 from l3ps_api.models.routes import router as models
+from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
+from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
@@ -43,7 +45,7 @@ from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
 from l3ps_platform.metrics import CatalogCollector, DiskCollector
-from l3ps_platform.objects import open_store
+from l3ps_platform.objects import open_store, parse_sources
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 from l3ps_platform.webhooks import Deliverer
@@ -70,6 +72,7 @@ Every error is a problem document (RFC 9457) that names the field at fault and t
 
 def create_app(settings: Settings) -> FastAPI:
     """The API of one service."""
+    parse_sources(settings.sources.get_secret_value())  # a service whose settings cannot be read does not start
     queue = Queue(settings)
     catalog = Catalog(settings.catalog_url, sender=queue.send)
     services = Services(settings, catalog, open_store(settings), queue)
@@ -86,7 +89,7 @@ def create_app(settings: Settings) -> FastAPI:
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention)
+    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention, rules, notifications)
     for router in (*resources, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
