@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
+.PHONY: help demo test fuzz-api bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -15,6 +15,9 @@ demo: setup ## label a simulated drive through the service; DRIVE=log MODEL=bund
 
 test: lint servers ## style, types, import rules and every test
 	$(RUN) pytest
+
+fuzz-api: servers ## send the API what its OpenAPI document allows and forbids; EXAMPLES=200 an operation take minutes
+	L3PS_FUZZ_EXAMPLES=$(or $(EXAMPLES),200) $(RUN) pytest -s --timeout 900 tests/contract/api/test_openapi_document.py
 
 lint: setup-dev
 	$(RUN) ruff check .
