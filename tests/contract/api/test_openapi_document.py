@@ -5,6 +5,7 @@ A few requests an operation here; ``make fuzz-api`` sends more.
 
 import os
 import secrets
+import sys
 from collections import defaultdict
 from contextlib import nullcontext, suppress
 
@@ -87,7 +88,7 @@ def test_whatever_is_sent_is_answered_as_the_document_says(url, document, known,
                     continue  # it never ends
                 for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
                     _try_out(url, operation, mode, known, session, seen[operation.label])
-    print({label: sorted(statuses) for label, statuses in seen.items()})
+    sys.stdout.write(f"{ {label: sorted(statuses) for label, statuses in seen.items()} }\n")
     for label in ("GET /v1/me", "POST /v1/keys", "GET /v1/jobs/{job_id}", "POST /v1/uploads"):
         assert min(seen[label]) < 300, f"{label} never did anything"
 
