@@ -69,7 +69,26 @@ class Settings(BaseSettings):
     public_url: str = ""  # empty: http://host:port
     host: str = "127.0.0.1"
     port: int = 8080
-    token: SecretStr | None = None  # None: no authentication, for loopback only
+    # The operator's. None: on loopback whoever reaches the service is the operator, elsewhere only API keys get in.
+    token: SecretStr | None = None
+    trusted_proxies: str = ""  # addresses whose X-Forwarded-For is believed, comma-separated; empty: nobody's
+
+    # What one API key (or, without keys, one address) may ask: 200 clients that each ask once a second under one key
+    # must pass, with room for what else they do.
+    rate_per_second: float = Field(default=1000.0, gt=0)
+    rate_burst: int = Field(default=2000, ge=1)
+    # Wrong credentials from one address. Secrets hold 256 bits, so this is about load, not about guessing.
+    failures_per_second: float = Field(default=10.0, gt=0)
+    failures_burst: int = Field(default=20, ge=1)
+    # How long a process believes what it has read about a key. In the process that revokes one it ends at once.
+    key_cache_seconds: float = Field(default=2.0, ge=0)
+    max_open_uploads: int = Field(default=1000, ge=1)  # of a project
+    max_active_jobs: int = Field(default=1000, ge=1)  # of a project, trainings too
+
+    idempotency_seconds: float = Field(default=24 * 3600.0, gt=0)  # life of an Idempotency-Key
+    # How long a request with a key is waited for before it is taken for dead. Joining the parts of the largest upload
+    # takes seconds; one that takes longer and still lives cannot commit once another has taken over.
+    idempotency_lease_seconds: float = Field(default=60.0, gt=0)
 
     scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
     # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
@@ -97,17 +116,29 @@ class Settings(BaseSettings):
     heartbeat_seconds: float = 10.0
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
+    # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
+    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    outage_retry_seconds: float = 60.0
+    outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0
     # A queued stage without a claim for this long whose message is not in the queue is sent again.
     resend_seconds: float = 30.0
+    # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
+    cancel_seconds: float = 10.0
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis
     # would deliver the message a second time.
     train_seconds: float = Field(default=20 * 3600.0, gt=0, lt=24 * 3600)
     progress_seconds: float = 0.5
+    # When Redis delivers a message again that nobody has acknowledged. Redelivery is no part of our recovery (leases
+    # are), so messages of long stages must not come back while they run: a task of 14 s under a visibility timeout of
+    # 5 s was started three times. Claims make that harmless, but each costs a look at the catalog.
+    visibility_seconds: int = Field(default=24 * 3600, gt=0)
 
     threads: int = 2  # of numeric libraries, per worker process
+    # Workers yield the processor to an API on the same machine, whose answers take milliseconds.
+    nice: int = Field(default=10, ge=0, le=19)
     concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
 
     # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping
@@ -162,6 +193,11 @@ class Settings(BaseSettings):
         elif value and not value.startswith("file:///"):
             raise ValueError("the object store is file:///DIR or s3://KEY:SECRET@host:port/bucket")
         return value
+
+    @property
+    def loopback(self) -> bool:
+        """Whether the API is reached from this machine alone."""
+        return self.host in ("127.0.0.1", "localhost", "::1")
 
     @property
     def catalog_url(self) -> str:

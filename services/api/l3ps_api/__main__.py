@@ -39,6 +39,9 @@ def main() -> None:
         log_config=None,
         access_log=False,
         server_header=False,
+        # Without it anyone on this machine could give itself any address, and with it any rate limit.
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=settings.trusted_proxies or None,
         timeout_graceful_shutdown=3,
     )
     server = Server(config, app.state.events)

@@ -2,7 +2,8 @@
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
 ``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
-``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``. What changes states is in
+``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction
+writes through ``outbox``), ``webhooks``. What changes states is in
 :mod:`l3ps_platform.workflow`.
 """
 
@@ -13,11 +14,17 @@ from l3ps_platform.catalog import (
     events,
     figures,
     jobs,
+    keys,
+    projects,
+    quotas,
+    requests,
     stages,
     trainings,
     uploads,
     webhooks,
 )
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
+from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
 from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
 from l3ps_platform.catalog.kinds import EventKind
@@ -51,6 +58,8 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
+    "AttemptRow",
     "Base",
     "Catalog",
     "DeliveryRow",
@@ -62,11 +71,14 @@ __all__ = [
     "JobRow",
     "JobState",
     "Json",
+    "ModelFiguresRow",
     "ModelRow",
     "ModelState",
+    "Outcome",
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -85,6 +97,10 @@ __all__ = [
     "events",
     "figures",
     "jobs",
+    "keys",
+    "projects",
+    "quotas",
+    "requests",
     "stages",
     "trainings",
     "uploads",

@@ -49,7 +49,8 @@ def settle_job(tx: Transaction, job: JobRow) -> None:
         return
     counts = _scene_counts(tx, job.id)
     publish = _publish_stage(tx, job.id)
-    if job.cancel_requested:
+    # With the manifest written the results are out: a cancel that comes then comes too late.
+    if job.cancel_requested and not (publish is not None and publish.state is StageState.DONE):
         if not _running(tx, job.id):
             _finish(tx, job, JobState.CANCELLED)
         return
