@@ -47,7 +47,7 @@ def demo(
             log = drive or _simulated(data / "drive")
             with (
                 Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack,
-                Client(stack.url, stack.options.token) as client,
+                Client(stack.url, stack.token) as client,
             ):
                 job = _run(client, stack, log, model or DEMO_MODEL, preset, segment)
                 labels = data / "labels" / job["id"]
