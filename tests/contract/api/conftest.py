@@ -27,6 +27,7 @@ from l3ps_platform.settings import Settings
 
 MiB = 1 << 20
 TUNING = {"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"}
+TUNING |= {"L3PS_LOG_FORMAT": "json"}  # test_logs reads them
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -83,6 +84,14 @@ class Service:
             assert time.monotonic() < deadline, document
             time.sleep(0.1)
         return document
+
+    @staticmethod
+    def until(true: Callable[[], bool], seconds: float = 60) -> None:
+        """Wait for something to be true."""
+        deadline = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
 
     def wait_for_drive(self, drive_id: str) -> dict:
         """A drive once it has been checked."""
