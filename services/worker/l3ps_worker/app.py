@@ -29,6 +29,7 @@ from l3ps_platform.errors import PlatformError  # noqa: E402
 from l3ps_platform.processes import die_with, is_child  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
+from l3ps_worker import plain_words  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
@@ -69,6 +70,9 @@ def _run(stage_id: str, attempt: int) -> None:
 for _stage, _task_name in TASK_NAMES.items():
     _seconds = settings.train_seconds if _stage is StageName.TRAIN else settings.stage_seconds
     app.task(name=_task_name, time_limit=_seconds)(_run)
+
+
+signals.celeryd_init.connect(plain_words.make_lines, weak=False)
 
 
 @signals.setup_logging.connect  # type: ignore[untyped-decorator]
