@@ -16,7 +16,7 @@ def test_a_cancelled_job_runs_again_and_a_succeeded_one_does_not(service, drive_
     assert (answer.status_code, answer.json()["state"]) == (202, "queued")
     assert service.wait_for_job(job)["state"] == "succeeded"
     document = service.refused(service.http.post(f"/v1/jobs/{job}/retry"), 409, "conflict")
-    assert "only a failed or cancelled job" in document["detail"]
+    assert "failed or cancelled job can be run again" in document["detail"]
 
 
 def test_unknown_ones_are_not_found(service) -> None:
