@@ -15,7 +15,7 @@ from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
-from l3ps_platform.catalog.models import JobRow, ModelRow, StageRow, StepRow, TrainingRow, UploadRow
+from l3ps_platform.catalog.models import JobRow, ModelRow, ProjectRow, StageRow, StepRow, TrainingRow, UploadRow
 from l3ps_platform.catalog.states import QUEUE_OF, JobState, QueueName, StageName, StageState, UploadState
 
 BOUNDS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
@@ -114,11 +114,15 @@ def open_stages(session: Session) -> dict[tuple[StageName, StageState], int]:
     return {(name, state): int(count) for name, state, count in rows}
 
 
+def projects(session: Session) -> list[str]:
+    """Ids of all projects."""
+    return list(session.scalars(select(ProjectRow.id).order_by(ProjectRow.id)))
+
+
 def job_states(session: Session, kind: type[JobRow] | type[TrainingRow]) -> dict[tuple[str, JobState], int]:
-    """Number of jobs or trainings by project and state, with a zero for states that none of a project's is in."""
+    """Number of jobs or trainings by project and state."""
     query = select(kind.project_id, kind.state, func.count()).group_by(kind.project_id, kind.state)
-    found = {(project_id, state): int(count) for project_id, state, count in session.execute(query)}
-    return {(project_id, state): 0 for project_id, _ in found for state in JobState} | found
+    return {(project_id, state): int(count) for project_id, state, count in session.execute(query)}
 
 
 def upload_states(session: Session) -> dict[UploadState, int]:
