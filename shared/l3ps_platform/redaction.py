@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from urllib.parse import quote, unquote, urlsplit
 
+from l3ps_platform.objects.sources import parse_sources
 from l3ps_platform.settings import S3Location, Settings
 
 SHORTEST = 6
@@ -49,6 +50,8 @@ def _secrets(settings: Settings) -> Iterator[str]:
         yield unquote(urlsplit(url).password or "")
     if settings.objects_url.startswith("s3://"):
         yield S3Location.parse(settings.objects_url).secret_key.get_secret_value()
+    for source in parse_sources(settings.sources.get_secret_value()):
+        yield source.location.secret_key.get_secret_value()
 
 
 def _forms(secret: str) -> set[str]:

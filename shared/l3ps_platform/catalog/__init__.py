@@ -1,13 +1,37 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics). What
-changes states is in :mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
+``outputs``, ``retention``, ``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``,
+``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through
+``outbox``), ``webhooks``. What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, figures, jobs, stages, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    belongings,
+    bundles,
+    drives,
+    events,
+    figures,
+    jobs,
+    keys,
+    outputs,
+    projects,
+    quotas,
+    requests,
+    retention,
+    rules,
+    stages,
+    trainings,
+    uploads,
+    webhooks,
+)
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
 from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
+from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
+from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -21,12 +45,16 @@ from l3ps_platform.catalog.models import (
     TrainingRow,
     UploadRow,
 )
+from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, RetentionRow
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
+from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -37,11 +65,17 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
+    "ArrivalRow",
     "AttemptRow",
     "Base",
     "Catalog",
+    "DeliveryRow",
+    "DeliveryState",
     "DriveRow",
     "DriveState",
+    "EventKind",
+    "EventRow",
     "JobRow",
     "JobState",
     "Json",
@@ -49,9 +83,15 @@ __all__ = [
     "ModelRow",
     "ModelState",
     "Outcome",
+    "OutputRow",
+    "OutputState",
+    "OutputUseRow",
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
+    "RetentionRow",
+    "RuleRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -63,12 +103,23 @@ __all__ = [
     "Transaction",
     "UploadRow",
     "UploadState",
+    "WebhookRow",
     "annotation_sets",
+    "belongings",
     "bundles",
     "drives",
+    "events",
     "figures",
     "jobs",
+    "keys",
+    "outputs",
+    "projects",
+    "quotas",
+    "requests",
+    "retention",
+    "rules",
     "stages",
     "trainings",
     "uploads",
+    "webhooks",
 ]

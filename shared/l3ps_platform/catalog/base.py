@@ -11,9 +11,11 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Mapped, declared_attr, mapped_column
 
 from l3ps_platform.catalog.states import (
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -74,7 +76,9 @@ class Base(DeclarativeBase):
         JobState: _states(JobState),
         StageState: _states(StageState),
         StageName: _states(StageName),
+        OutputState: _states(OutputState),
         QueueName: _states(QueueName),
+        DeliveryState: _states(DeliveryState),
     }
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -16,7 +18,9 @@ from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
-from l3ps_platform.catalog.base import Owned
+from l3ps_platform.catalog.base import Json, Owned
+from l3ps_platform.catalog.kinds import EventKind
+from l3ps_platform.catalog.outbox import Happening, write
 from l3ps_platform.catalog.states import QueueName, StageName
 from l3ps_platform.errors import CatalogUnavailable
 
@@ -50,11 +54,17 @@ class Transaction:
         now: one time for everything the transaction writes, by the database server's clock, so that workers
             whose clocks disagree still agree on leases.
         outbox: messages to send after the commit.
+        happenings: events that go into the log with the commit.
     """
 
     session: Session
     now: datetime
     outbox: list[StageMessage] = field(default_factory=list)
+    happenings: list[Happening] = field(default_factory=list)
+
+    def emit(self, kind: EventKind, subject: Owned, data: Json) -> None:
+        """Something happened to a row: it goes into the log, and to webhooks, if and when the transaction commits."""
+        self.happenings.append(Happening(kind, subject, data))
 
 
 class Catalog:
@@ -80,6 +90,42 @@ class Catalog:
         scoped._project = project_id
         return scoped
 
+    def whole(self) -> Catalog:
+        """This catalog with every project's rows, for whoever cleans up."""
+        whole = copy(self)
+        whole._project = None
+        return whole
+
+    @contextmanager
+    def alone(self, what: str) -> Iterator[bool]:
+        """Whether nobody else is at this work now, in any process; held until the block ends or the process dies."""
+        if self.engine.dialect.name == "sqlite":
+            with open(f"{self.engine.url.database}.{what}", "w") as file:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    yield False
+                else:
+                    yield True
+            return
+        # A lock of the session, not of a transaction: no snapshot is held open while the work goes on.
+        with self._connected() as connection:
+            key = {"key": zlib.crc32(what.encode())}
+            mine = bool(connection.execute(text("SELECT pg_try_advisory_lock(:key)"), key).scalar_one())
+            try:
+                yield mine
+            finally:
+                if mine:
+                    connection.execute(text("SELECT pg_advisory_unlock(:key)"), key)
+
+    @contextmanager
+    def _connected(self) -> Iterator[Connection]:
+        try:
+            with self.engine.connect() as connection:
+                yield connection.execution_options(isolation_level="AUTOCOMMIT")
+        except (OperationalError, InterfaceError) as error:
+            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
         """A writing transaction; commits on leaving, rolls back on any exception, then sends the messages.
@@ -89,6 +135,8 @@ class Catalog:
         with self._session(write=True) as session:
             transaction = Transaction(session, self.now(session))
             yield transaction
+            if transaction.happenings:
+                write(session, transaction.happenings, transaction.now)
             session.commit()
         self._flush(transaction.outbox)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from sqlalchemy import case, func, or_, select
 from sqlalchemy.orm import Session
 
-from l3ps_platform.catalog.models import StageRow, StepRow
+from l3ps_platform.catalog.models import JobRow, StageRow, StepRow, TrainingRow
 from l3ps_platform.catalog.states import StageName, StageState
 from l3ps_platform.errors import NotFound
 
@@ -72,6 +72,24 @@ def owned(session: Session, owner_prefix: str) -> list[tuple[str, str]]:
         StageRow.state == StageState.RUNNING, StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
     )
     return [(id, owner) for id, owner in session.execute(query) if owner is not None]
+
+
+def cancelled_of(session: Session, owner_prefix: str) -> list[tuple[str, str, StageName]]:
+    """(id, owner, name) of the running stages whose owner's name begins so and whose job or training is to stop.
+
+    Their rows are held until the transaction ends, so that no owner can go on to another stage meanwhile.
+    """
+    asked = or_(JobRow.cancel_requested.is_(True), TrainingRow.cancel_requested.is_(True))
+    query = (
+        select(StageRow.id, StageRow.lease_owner, StageRow.name)
+        .outerjoin(JobRow, JobRow.id == StageRow.job_id)
+        .outerjoin(TrainingRow, TrainingRow.id == StageRow.training_id)
+        .where(StageRow.state == StageState.RUNNING, asked)
+        .where(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
+        .order_by(StageRow.id)
+    )
+    rows = session.execute(query.with_for_update(of=StageRow))
+    return [(id, owner, name) for id, owner, name in rows if owner is not None]
 
 
 def steps(session: Session, stage_ids: Sequence[str]) -> dict[str, list[StepRow]]:

@@ -23,6 +23,7 @@ def add(
     filename: str,
     size: int,
     parts: int,
+    part_size: int = 0,
     object_key: str,
     s3_upload_id: str,
     seconds: int,
@@ -38,6 +39,7 @@ def add(
         size=size,
         sha256=sha256,
         parts=parts,
+        part_size=part_size,
         state=UploadState.OPEN,
         object_key=object_key,
         s3_upload_id=s3_upload_id,
@@ -52,6 +54,14 @@ def add(
 def get(session: Session, id: str) -> UploadRow:
     """One upload. NotFound."""
     return queries.get(session, UploadRow, id)
+
+
+def page(
+    session: Session, *, limit: int = 50, before: str | None = None, state: UploadState | None = None
+) -> list[UploadRow]:
+    """Uploads, newest first, after the cursor ``before`` (the last id of the page before)."""
+    chosen = [UploadRow.state == state] if state is not None else []
+    return queries.page(session, UploadRow, *chosen, limit=limit, before=before)
 
 
 def lock(session: Session, id: str) -> UploadRow:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import structlog
+from sqlalchemy import update
 
 from l3ps_platform.catalog.attempt_rows import ESTIMATES, AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Json
@@ -59,7 +60,15 @@ def note_end(
     )
     tx.session.add(row)
     if cost is None and outcome in _FAILURES:  # else the worker that ran it says so
-        log.warning("attempt lost", **ids(stage), owner=row.owner, cause=cause, again=outcome is Outcome.LOST)
+        log.warning("attempt lost", **ids(stage), owner=row.owner, cause=cause)
+
+
+def note_again(tx: Transaction, stage: StageRow, outcome: Outcome) -> None:
+    """Another attempt follows the one that this transaction noted as failed."""
+    noted = (AttemptRow.stage_id == stage.id, AttemptRow.attempt == stage.attempt, AttemptRow.finished_at == tx.now)
+    tx.session.execute(
+        update(AttemptRow).where(*noted, AttemptRow.outcome == Outcome.FAILED.value).values(outcome=outcome.value)
+    )
 
 
 def note_figures(tx: Transaction, job: JobRow, quality: Json | None, estimates: Json | None) -> None:

@@ -6,8 +6,7 @@ Runs in a thread of the API; several may run at once, since every change is cond
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
-from contextlib import suppress
+import time
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
@@ -15,25 +14,26 @@ from typing import TYPE_CHECKING
 import structlog
 from sqlalchemy import select, update
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
 from l3ps_platform.catalog.attempt_rows import Outcome
-from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
+from l3ps_platform.catalog.models import StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
-from l3ps_platform.catalog.states import QueueName, StageState, UploadState
-from l3ps_platform.errors import Conflict, PlatformError
+from l3ps_platform.catalog.states import QueueName, StageState
+from l3ps_platform.errors import CatalogUnavailable, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.attempts import note_end
-from l3ps_platform.workflow.claims import changed, lock_parents
+from l3ps_platform.workflow.causes import Cause, failure
+from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
+from l3ps_platform.workflow.sweep import Sweeper
 
 if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it
     from l3ps_platform.queue import Queue
 
 log = structlog.get_logger(__name__)
 
-LOST = {"message": "the worker that ran this stage stopped answering", "problems": []}
 BATCH = 200
 
 
@@ -46,6 +46,11 @@ class Report:
     resent: int = 0
     uploads: int = 0
     archives: int = 0
+    expired_jobs: int = 0
+    jobs: int = 0
+    outputs: int = 0
+    orphans: int = 0
+    arrivals: int = 0
 
 
 class Reconciler:
@@ -54,24 +59,29 @@ class Reconciler:
     Args:
         catalog: whose sender is ``queue.send``.
         queue: to see which messages are still on their way.
-        store: to drop abandoned uploads and archives of what was rejected or deleted.
+        store: for the sweep of what nobody needs any more.
         settings: intervals and limits.
     """
 
     def __init__(self, catalog: Catalog, queue: Queue, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
         self._queue = queue
-        self._store = store
         self._settings = settings
-        self._retry = Retry(settings.max_attempts, settings.retry_seconds)
+        self._sweeper = Sweeper(catalog, store, settings)
+        self._retry = Retry.of(settings)
+        self._leases_count_from = float("-inf")
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until ``stop`` is set; a round that fails is logged and the next one tries again."""
+        self._bear_old_leases()
         while not stop.wait(self._settings.reconcile_seconds):
             try:
                 report = self.run_once()
                 if report != Report():
                     log.info("reconciled", **{name: getattr(report, name) for name in Report.__slots__})
+            except CatalogUnavailable as error:
+                self._bear_old_leases()
+                log.warning("reconciler waits", reason=str(error))
             except PlatformError as error:
                 log.warning("reconciler waits", reason=str(error))
             except Exception:
@@ -83,11 +93,20 @@ class Reconciler:
             expired=self._expire_leases(),
             retried=self._release_retries(),
             resent=self._resend(),
-            uploads=self._abort_uploads(),
-            archives=self._delete_archives(),
+            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds),
+            **self._sweeper.run_once(),
         )
 
+    def _bear_old_leases(self) -> None:
+        """For a lease's time to come, do not conclude from one that has run out that its worker is gone.
+
+        While the catalog was away nobody could prolong any; and who has just started does not know whether it was.
+        """
+        self._leases_count_from = time.monotonic() + self._settings.lease_seconds
+
     def _expire_leases(self) -> int:
+        if time.monotonic() < self._leases_count_from:
+            return 0
         count = 0
         for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
             with self._catalog.transaction() as tx:
@@ -125,37 +144,6 @@ class Reconciler:
                     tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
             return len(tx.outbox)
 
-    def _abort_uploads(self) -> int:
-        with self._catalog.reading() as session:
-            over = uploads.expired(session, self._catalog.now(session))
-        for row in over:
-            with self._catalog.transaction() as tx, suppress(Conflict):  # completed in this moment
-                uploads.close(tx, row.id, UploadState.ABORTED)
-        with self._catalog.reading() as session:
-            rows = uploads.leftover(session)
-        for row in rows:
-            self._store.abort_multipart(row.object_key, row.s3_upload_id)
-            self._store.delete(row.object_key)  # joined, when the API died before it could say so
-            with self._catalog.transaction() as tx:
-                uploads.lock(tx.session, row.id).s3_upload_id = ""
-        return len(rows)
-
-    def _delete_archives(self) -> int:
-        with self._catalog.reading() as session:
-            found: Iterable[AnnotationsRow | DriveRow | ModelRow] = [
-                *annotation_sets.leftover_archives(session),
-                *drives.leftover_archives(session),
-                *bundles.leftover_archives(session),
-            ]
-        count = 0
-        for row in found:
-            if row.object_key is not None:
-                self._store.delete(row.object_key)
-            with self._catalog.transaction() as tx:
-                tx.session.merge(row, load=True).object_key = None
-                count += 1
-        return count
-
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:
             query = select(StageRow.id).where(*conditions).order_by(StageRow.id).limit(BATCH)  # type: ignore[arg-type]
@@ -174,6 +162,7 @@ def lease_lost(
     expired_before: datetime | None = None,
     owner_prefix: str | None = None,
     reason: str | None = None,
+    cause: Cause = Cause.LEASE_LOST,
 ) -> bool:
     """End a running attempt whose worker is gone: tried again, failed for good, or cancelled with its job.
 
@@ -184,6 +173,7 @@ def lease_lost(
         expired_before: only if its lease ended before this.
         owner_prefix: only if its owner's name begins so (a worker's main process reports its own dead child).
         reason: what to tell the user.
+        cause: and in one word.
     """
     stage = tx.session.get(StageRow, stage_id)
     if stage is None:
@@ -194,12 +184,11 @@ def lease_lost(
         conditions.append(StageRow.lease_until < expired_before)
     if owner_prefix is not None:
         conditions.append(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
-    error = LOST if reason is None else {"message": reason, "problems": []}
+    error = LOST if reason is None else failure(reason, cause)
     values = {"state": StageState.FAILED, "lease_owner": None, "lease_until": None, "finished_at": tx.now}
     if not changed(tx, update(StageRow).where(*conditions).values(**values, error=error)):
         return False
-    again = stage.attempt < retry.max_attempts
-    note_end(tx, stage, Outcome.LOST if again else Outcome.FAILED, error=error)
+    note_end(tx, stage, Outcome.FAILED, error=error)
     tx.session.refresh(stage)
-    failed(tx, stage, retry if again else None)
+    failed(tx, stage, retry, Outcome.LOST)
     return True

@@ -10,10 +10,12 @@ from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
-from l3ps_api.problems import ApiProblem, items
+from l3ps_api.limits import over_quota
+from l3ps_api.problems import ApiProblem, invalid, items
 from l3ps_api.services import Services
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
-from l3ps_platform.workflow import cancel_job, submit_job
+from l3ps_api.sources import permitted
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
+from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
 
 log = structlog.get_logger(__name__)
 
@@ -24,11 +26,18 @@ _STEPS = (
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
 
 
-def create(services: Services, request: JobRequest) -> Job:
-    """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
+def create(services: Services, project_id: str, request: JobRequest) -> Job:
+    """A new job. NotFound for its drive or model; 422 with the problems of a rejected one; 403 for a foreign source."""
+    if (request.drive_id is None) == (request.source is None):
+        what = "a job is on one drive or on one source, and neither or both are named"
+        raise invalid("drive_id", what, "Name either drive_id or source.")
+    source = None if request.source is None else permitted(services, project_id, request.source)
+    settings = request.model_dump(exclude={"drive_id", "source"})
     try:
         with services.catalog.transaction() as tx:
-            job = submit_job(tx, **request.model_dump())
+            check_active_jobs(services, tx.session)
+            drive_id = request.drive_id or accept_source(tx, source=str(source)).id
+            job = submit_job(tx, drive_id=drive_id, **settings)
     except InputError as error:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
@@ -40,6 +49,13 @@ def create(services: Services, request: JobRequest) -> Job:
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
     log.info("job accepted", job=job.id, drive=job.drive_id, model=job.model_id)
     return get(services, job.id)
+
+
+def check_active_jobs(services: Services, session: Session) -> None:
+    """429 where the project has as many jobs and trainings under way as it may; a few more when asked in parallel."""
+    limit = services.settings.max_active_jobs
+    if quotas.active_jobs(session) >= limit:
+        raise over_quota("jobs", limit, "jobs and trainings under way", "Wait for some to end, or cancel them.")
 
 
 def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted) -> JobPage:
@@ -79,6 +95,22 @@ def cancel(services: Services, job_id: str) -> Job:
     with services.catalog.transaction() as tx:
         cancel_job(tx, job_id)
     return get(services, job_id)
+
+
+def retry(services: Services, job_id: str) -> Job:
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    with services.catalog.reading() as session:
+        wanted = outputs_to_keep(session, job_id)
+    gone = [key for key in wanted if not services.store.exists(key)]
+    with services.catalog.transaction() as tx:
+        retry_job(tx, job_id, gone)
+    return get(services, job_id)
+
+
+def delete(services: Services, job_id: str) -> None:
+    """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
+    with services.catalog.transaction() as tx:
+        jobs.delete(tx, job_id)
 
 
 def _document(session: Session, job_id: str) -> Job:

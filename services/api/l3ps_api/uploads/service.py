@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from contextlib import suppress
+from datetime import UTC, datetime
 from typing import Any
 
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
+from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
-from l3ps_api.uploads.parts import part_count, part_size
-from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
+from l3ps_api.uploads.arrival import join
+from l3ps_api.uploads.parts import part_count, part_length, part_size, size_of_parts
+from l3ps_api.uploads.schemas import (
+    Completion,
+    OpenUpload,
+    PartUrl,
+    PartUrls,
+    ReceivedPart,
+    Upload,
+    UploadPage,
+    UploadProgress,
+    UploadRequest,
+)
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
 from l3ps_platform.catalog import (
     ModelState,
@@ -21,15 +36,13 @@ from l3ps_platform.catalog import (
     annotation_sets,
     bundles,
     drives,
+    quotas,
     uploads,
 )
 from l3ps_platform.errors import Conflict, NotFound, UploadError
 from l3ps_platform.ids import new_id
-from l3ps_platform.objects import Part, segment
+from l3ps_platform.objects import MAX_SECONDS
 from l3ps_platform.workflow import accept_drive, accept_model
-
-_PRESIGN_SECONDS = 7 * 24 * 3600
-"""S3's limit for the life of a presigned URL."""
 
 _REMEDIES = {
     "drive": "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst.",
@@ -56,11 +69,14 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
         what = f"{request.size} bytes are more than the {limit} bytes that kind {request.kind} may have"
         raise too_large("size", what, f"{smaller}, or raise L3PS_{setting.upper()}.")
     upload_id, count = new_id("upl"), part_count(request.size, settings)
-    key = f"uploads/{upload_id}/{segment(request.filename)}"
-    seconds = min(settings.upload_ttl_seconds, _PRESIGN_SECONDS)
+    key = f"uploads/{upload_id}/archive"  # nothing of the client's: what it calls the file is the row's
+    seconds = min(settings.upload_ttl_seconds, MAX_SECONDS)
     multipart = services.store.create_multipart(key)
     try:
         with services.catalog.transaction() as tx:
+            if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
+                remedy = "Complete some of them, or give them up."
+                raise over_quota("uploads", settings.max_open_uploads, "open uploads", remedy)
             row = uploads.add(
                 tx,
                 id=upload_id,
@@ -69,6 +85,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 size=request.size,
                 sha256=request.sha256,
                 parts=count,
+                part_size=part_size(request.size, settings),
                 object_key=key,
                 s3_upload_id=multipart,
                 seconds=seconds,
@@ -76,21 +93,52 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     except BaseException:
         services.store.abort_multipart(key, multipart)
         raise
-    urls = [
-        PartUrl(
-            number=number,
-            url=services.store.presign_part(key, multipart, number, seconds),
-        )
-        for number in range(1, count + 1)
-    ]
-    size = part_size(request.size, settings)
-    return OpenUpload(**_fields(row), part_size=size, parts=urls)
+    urls = _presigned(services, row, range(1, count + 1))
+    return OpenUpload(**_fields(row), part_size=row.part_size, parts=urls)
 
 
-def get(services: Services, upload_id: str) -> Upload:
-    """An upload's state."""
+def opened(services: Services, upload_id: str) -> OpenUpload:
+    """An upload as its opening answered, with fresh URLs. NotFound."""
     with services.catalog.reading() as session:
-        return Upload(**_fields(uploads.get(session, upload_id)))
+        row = uploads.get(session, upload_id)
+    urls = _presigned(services, row, range(1, row.parts + 1))
+    return OpenUpload(**_fields(row), part_size=part_size(row.size, services.settings), parts=urls)
+
+
+def page(services: Services, limit: int, cursor: str | None, state: UploadState | None) -> UploadPage:
+    """One page, newest first."""
+    with services.catalog.reading() as session:
+        rows = uploads.page(session, limit=limit + 1, before=cursor, state=state)
+    shown = rows[:limit]
+    items = [Upload(**_fields(row)) for row in shown]
+    return UploadPage(items=items, next=shown[-1].id if len(rows) > limit else None)
+
+
+def get(services: Services, upload_id: str) -> UploadProgress:
+    """An upload's state and what of it has arrived. NotFound."""
+    with services.catalog.reading() as session:
+        row = uploads.get(session, upload_id)
+    received: list[ReceivedPart] = []
+    if row.state is UploadState.OPEN:
+        with suppress(UploadError):  # closed in this moment
+            received = [
+                ReceivedPart(number=part.number, size=part.size, etag=part.etag)
+                for part in services.store.list_parts(row.object_key, row.s3_upload_id)
+                if part.size is not None and part.size == part_length(part.number, row, services.settings)
+            ]
+    each = size_of_parts(row, services.settings)
+    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received)
+
+
+def urls(services: Services, upload_id: str, numbers: Iterable[int]) -> PartUrls:
+    """Fresh URLs for parts of an open upload. NotFound; refuses closed uploads and parts it does not have."""
+    with services.catalog.reading() as session:
+        row = _must_be_open(uploads.get(session, upload_id))
+    wanted = sorted(set(numbers))
+    if wanted[-1] > row.parts:
+        what = f"the upload has the parts 1 to {row.parts}, {wanted[-1]} is none of them"
+        raise invalid("numbers", what, "Ask for parts that `received` of the upload lacks.", code="invalid-parts")
+    return PartUrls(part_size=size_of_parts(row, services.settings), parts=_presigned(services, row, wanted))
 
 
 def abort(services: Services, upload_id: str) -> None:
@@ -109,13 +157,9 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         row = uploads.get(session, upload_id)
     if row.state is UploadState.COMPLETE:
         return _result(services, row)
-    if row.state is not UploadState.OPEN:
-        detail = f"Upload {upload_id} is {row.state}. Begin a new one with POST /v1/uploads."
-        raise conflict("upload-closed", "The upload is closed", detail)
-    name = _name(row, completion)
+    name = _name(_must_be_open(row), completion)
     # No row is held while the store joins the parts: that can take seconds, and SQLite has one lock for all writers.
-    _join(services, row, completion)
-    refusal = _look(services, row)
+    refusal = join(services, row, completion) or _look(services, row)
     if refusal is not None:
         _discard(services, row)
         raise refusal
@@ -129,21 +173,6 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         services.store.delete(row.object_key)
     with services.catalog.reading() as session:
         return _result(services, uploads.get(session, upload_id))
-
-
-def _join(services: Services, row: UploadRow, completion: Completion) -> None:
-    numbers = [part.number for part in completion.parts]
-    if sorted(numbers) != list(range(1, row.parts + 1)):
-        what = f"the upload has the parts 1 to {row.parts}, each once; {len(numbers)} were named"
-        raise invalid("parts", what, "Name every part once, with the ETag its PUT answered.", code="invalid-parts")
-    try:
-        parts = [Part(part.number, part.etag) for part in completion.parts]
-        services.store.complete_multipart(row.object_key, row.s3_upload_id, parts)
-    except UploadError as error:
-        # An earlier try may have joined the parts and then lost its answer or its catalog.
-        if not services.store.exists(row.object_key):
-            remedy = "PUT the parts again and name each with the ETag of its answer."
-            raise invalid("parts", str(error), remedy, code="invalid-parts") from error
 
 
 def _look(services: Services, row: UploadRow) -> ApiProblem | None:
@@ -162,7 +191,27 @@ def _look(services: Services, row: UploadRow) -> ApiProblem | None:
 def _discard(services: Services, row: UploadRow) -> None:
     with services.catalog.transaction() as tx:
         uploads.close(tx, row.id, UploadState.ABORTED)
+    services.store.abort_multipart(row.object_key, row.s3_upload_id)
     services.store.delete(row.object_key)
+
+
+def _must_be_open(row: UploadRow) -> UploadRow:
+    if row.state is not UploadState.OPEN:
+        detail = f"Upload {row.id} is {row.state}. Begin a new one with POST /v1/uploads."
+        raise conflict("upload-closed", "The upload is closed", detail, where="path", remedy="Begin a new upload.")
+    return row
+
+
+def _presigned(services: Services, row: UploadRow, numbers: Iterable[int]) -> list[PartUrl]:
+    """URLs that outlive the upload's remaining time by nothing, each for a body of the part's size alone."""
+    seconds = int((row.expires_at - datetime.now(UTC)).total_seconds())
+    seconds = max(1, min(seconds, services.settings.upload_ttl_seconds, MAX_SECONDS))
+    store, settings = services.store, services.settings
+    sized = [(number, part_length(number, row, settings)) for number in numbers]
+    return [
+        PartUrl(number=number, url=store.presign_part(row.object_key, row.s3_upload_id, number, seconds, length))
+        for number, length in sized
+    ]
 
 
 def _name(row: UploadRow, completion: Completion) -> str:
@@ -197,8 +246,10 @@ def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> D
         now = uploads.get(session, row.id)
     if now.state is UploadState.COMPLETE:
         return _result(services, now)
-    if now.state is UploadState.OPEN:
-        _discard(services, row)
+    if now.state is UploadState.ABORTED:  # given up while its parts were joined
+        services.store.delete(row.object_key)
+        _must_be_open(now)
+    _discard(services, row)
     detail = f"{str(error)[:1].upper()}{str(error)[1:]}. Nothing was kept."
     raise conflict("name-taken", "The name is taken", detail, where="name", remedy="Choose another name.") from error
 
