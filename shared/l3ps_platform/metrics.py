@@ -32,9 +32,9 @@ from l3ps_platform.catalog import (
     TrainingRow,
     figures,
 )
-from l3ps_platform.catalog.attempt_rows import CAUSES
 from l3ps_platform.errors import PlatformError
 from l3ps_platform.quality_metrics import estimates, job_quality, model_quality
+from l3ps_platform.workflow.causes import Cause
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
@@ -234,7 +234,7 @@ def _ends(attempts: dict[figures.Kind, figures.Tally]) -> list[Metric]:
         unused = sum(tally.cpu_seconds for outcome, tally in ends.items() if outcome is not Outcome.DONE)
         wasted.add_metric([stage.value], unused)
         cached.add_metric([stage.value], from_cache.get((stage.value,), figures.Tally()).count)
-    by_cause = {(stage.value, cause): figures.Tally() for stage in StageName for cause in CAUSES}
+    by_cause = {(stage.value, cause.value): figures.Tally() for stage in StageName for cause in Cause}
     by_cause |= _grouped(attempts, lambda kind: (kind.stage.value, kind.cause) if kind.cause else None)
     for labels, tally in by_cause.items():
         failures.add_metric(labels, tally.count)
@@ -276,7 +276,10 @@ def _states(session: Session, attempts: dict[figures.Kind, figures.Tally]) -> li
     uploads = GaugeMetricFamily("l3ps_uploads", "Uploads by state.", labels=["state"])
     for upload_state, count in figures.upload_states(session).items():
         uploads.add_metric([upload_state.value], count)
-    return [*families, stages, uploads]
+    messages = GaugeMetricFamily("l3ps_webhook_deliveries", "Messages to webhooks by state.", labels=["state"])
+    for delivery_state, count in figures.delivery_states(session).items():
+        messages.add_metric([delivery_state.value], count)
+    return [*families, stages, uploads, messages]
 
 
 def _queues(session: Session, now: datetime) -> list[Metric]:

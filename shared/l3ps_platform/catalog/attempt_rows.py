@@ -24,14 +24,6 @@ class Outcome(StrEnum):
     CANCELLED = "cancelled"
 
 
-CAUSES = (
-    *("crashed", "out-of-memory", "lease-lost", "timeout", "store-unavailable", "catalog-unavailable", "disk-full"),
-    *("bad-input", "processing", "internal"),
-)
-"""What a failed attempt is put down to. Others are counted as well; these are there before they ever happen, so that
-the first of one shows as an increase."""
-
-
 class AttemptRow(Owned, Base):
     """One attempt at a stage that has ended. Rows are only added, so that sums over them never go down.
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 
 import pytest
 
@@ -37,6 +38,16 @@ def lines(service) -> list[dict]:
     return [json.loads(line) for text in read(service).values() for line in text.splitlines()]
 
 
+def answered(service, request: str) -> dict:
+    """The line that a request ends with; it is written after the answer has left."""
+    deadline = time.monotonic() + 30
+    while True:
+        for line in lines(service):
+            if (line["event"], line.get("request")) == ("answered", request):
+                return line
+        assert time.monotonic() < deadline
+
+
 def test_every_line_parses_and_says_who_and_when(service, job):
     found = lines(service)
     assert {"api", "worker"} <= {line["service"] for line in found}
@@ -56,22 +67,24 @@ def test_the_lines_of_a_job_carry_its_ids_in_every_process(service, job):
 
 
 def test_the_request_that_made_a_job_can_be_found_from_it(service, job):
+    found = answered(service, REQUEST)
+    assert (found["method"], found["route"], found["status"]) == ("POST", "/v1/jobs", 202)
+    assert found["bytes"] > 0 and found["bytes_in"] > 0 and found["seconds"] > 0
     mine = [line for line in lines(service) if line.get("request") == REQUEST]
     assert {line["job"] for line in mine if line["event"] == "job accepted"} == {job["id"]}
-    (answered,) = [line for line in mine if line["event"] == "answered"]
-    assert (answered["method"], answered["route"], answered["status"]) == ("POST", "/v1/jobs", 202)
-    assert answered["bytes"] > 0 and answered["bytes_in"] > 0 and answered["seconds"] > 0
 
 
 def test_requests_are_logged_by_route_and_machines_own_are_not(service, job):
     service.http.get("/healthz")
     service.http.get("/metrics")
-    service.http.get("/v1/jobs/job_none?secret=in-the-query", headers={"X-Request-Id": "not harmless"})
-    answered = [line for line in lines(service) if line["event"] == "answered"]
-    assert not [line for line in answered if line["route"] in ("/healthz", "/readyz", "/metrics")]
-    last = answered[-1]
-    assert (last["route"], last["job"], last["status"]) == ("/v1/jobs/{job_id}", "job_none", 404)
-    assert re.fullmatch("req_[0-9a-f]{16}", last["request"])
+    given = service.http.get("/v1/jobs/job_none", headers={"X-Request-Id": "not harmless"}).headers["x-request-id"]
+    assert re.fullmatch("req_[0-9a-f]{16}", given)
+    refused = service.http.get("/v1/jobs?secret=in-the-query").headers["x-request-id"]
+    found = answered(service, given)
+    assert (found["route"], found["job"], found["status"]) == ("/v1/jobs/{job_id}", "job_none", 404)
+    assert answered(service, refused)["status"] == 422
+    routes = {line["route"] for line in lines(service) if line["event"] == "answered"}
+    assert not routes & {"/healthz", "/readyz", "/metrics"}
     assert "in-the-query" not in "".join(read(service).values())
 
 
