@@ -11,7 +11,6 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.stack import free_port
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -31,20 +30,6 @@ def panel_expressions() -> list[str]:
     return [target["expr"] for panel in panels for target in panel.get("targets", [])]
 
 
-@pytest.fixture(scope="module")
-def busy(service, drive_log, bundle, tmp_path_factory):
-    """A service that has done a job."""
-    folder = tmp_path_factory.mktemp("monitored")
-    pack_log(drive_log, folder / "log.tar")
-    pack_bundle(bundle, folder / "model.zip")
-    service.upload((folder / "model.zip").read_bytes(), "model.zip", "model", name="monitored")
-    drive = service.upload((folder / "log.tar").read_bytes(), "log.tar").json()
-    request = {"drive_id": drive["id"], "model": "monitored", "preset": "fast"}
-    job = service.wait_for_job(service.http.post("/v1/jobs", json=request).json()["id"])
-    assert job["state"] == "succeeded", job
-    return service
-
-
 def told(service) -> dict[str, set[str]]:
     """The names of all samples, each with the names of its labels."""
     found: dict[str, set[str]] = {}
@@ -55,9 +40,9 @@ def told(service) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("expressions", [rule_expressions, panel_expressions])
-def test_every_figure_asked_for_is_told_with_the_labels_asked_for(busy, expressions):
-    known = told(busy)
-    embedded = busy.settings.store_url.startswith("file:")
+def test_every_figure_asked_for_is_told_with_the_labels_asked_for(service, observed, expressions):
+    known = told(service)
+    embedded = service.settings.store_url.startswith("file:")
     for expression in expressions():
         for name in set(NAMES.findall(expression)) - (set() if embedded else ONLY_EMBEDDED):
             assert name in known, f"{name} of {expression}"
@@ -67,13 +52,13 @@ def test_every_figure_asked_for_is_told_with_the_labels_asked_for(busy, expressi
 
 
 @pytest.mark.once
-def test_a_real_prometheus_scrapes_the_service_and_evaluates_it_all(busy, prometheus_tool, tmp_path):
+def test_a_real_prometheus_scrapes_the_service_and_evaluates_it_all(service, observed, prometheus_tool, tmp_path):
     """Every rule without a fault, none of them firing after a job that went well; every panel's question answered."""
     config = yaml.safe_load((DEPLOY / "prometheus" / "prometheus.yml").read_text())
     config["global"] = {"scrape_interval": "500ms", "scrape_timeout": "500ms", "evaluation_interval": "500ms"}
     config["rule_files"] = [str(RULES)]
     config["scrape_configs"] = config["scrape_configs"][:1]
-    config["scrape_configs"][0]["static_configs"][0]["targets"] = [busy.url.removeprefix("http://")]
+    config["scrape_configs"][0]["static_configs"][0]["targets"] = [service.url.removeprefix("http://")]
     (tmp_path / "prometheus.yml").write_text(yaml.safe_dump(config))
     url = f"http://127.0.0.1:{free_port()}"
     address = f"--web.listen-address={url.removeprefix('http://')}"
