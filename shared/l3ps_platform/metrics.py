@@ -12,6 +12,7 @@ Who has more to tell adds a source: ``collector.add(source)`` with a function fr
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, TypeVar
@@ -46,6 +47,9 @@ log = structlog.get_logger(__name__)
 
 Source = Callable[["Session"], Iterable[Metric]]
 
+Sums = tuple[dict[figures.Kind, figures.Tally], dict[str, tuple[int, float]]]
+"""Of attempts by kind, and of steps by name: how often, and seconds."""
+
 LATE = timedelta(minutes=5)
 """How long after its clock was read a transaction may still commit. Ours take milliseconds; one that waits for a row
 that another process holds takes seconds."""
@@ -58,11 +62,14 @@ class History:
         self._until: datetime | None = None
         self._attempts: dict[figures.Kind, figures.Tally] = {}
         self._steps: dict[str, tuple[int, float]] = {}
+        self._lock = threading.Lock()  # two scrapes at once would remember the same span twice
 
-    def read(
-        self, session: Session, now: datetime
-    ) -> tuple[dict[figures.Kind, figures.Tally], dict[str, tuple[int, float]]]:
+    def read(self, session: Session, now: datetime) -> Sums:
         """The sums, of attempts by kind and of steps by name."""
+        with self._lock:
+            return self._read(session, now)
+
+    def _read(self, session: Session, now: datetime) -> Sums:
         if self._until is None or self._until < now - 2 * LATE:
             settled = now - LATE
             past = figures.tallies(session, self._until, settled), figures.step_tallies(session, self._until, settled)

@@ -1,5 +1,7 @@
 """What Prometheus is told, computed from both databases and a real Redis."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -191,6 +193,24 @@ def test_counters_never_go_down_and_the_past_is_read_once(catalog: Catalog, play
         tx.session.execute(update(AttemptRow).where(AttemptRow.id.in_(first)).values(points=0))
     assert scraped(collector)[points] == 20
     assert scrape(catalog, tidy.queue)[points] == 10, "and a new process does sum it"
+
+
+def test_scrapes_at_the_same_time_remember_the_past_once(catalog: Catalog, play, sent, tidy, cost) -> None:
+    play.submit(scenes=1)
+    while sent:
+        play.run(lambda tx, claim: workflow.complete(tx, claim, cost))
+    with catalog.transaction() as tx:
+        for row in tx.session.scalars(select(AttemptRow)):
+            row.finished_at -= 2 * LATE
+    collector, barrier = CatalogCollector(catalog, tidy.queue), threading.Barrier(4)
+
+    def scrape_with_others(_: int) -> Found:
+        barrier.wait()
+        return scraped(collector)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(scrape_with_others, range(4)))
+    assert scraped(collector)["l3ps_points_total", (("project", "prj_default"), ("stage", "refine"))] == 10
 
 
 def test_the_quality_of_a_model_is_that_of_its_latest_job(catalog: Catalog, play, sent, tidy, cost) -> None:
