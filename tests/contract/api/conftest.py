@@ -18,6 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
 from l3ps_cli.main import app
+from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import QUEUES, STOP_WORKER, TRAINER_QUEUES, WORKER, Stack, StackOptions, free_port
 from l3ps_platform import workflow
@@ -249,6 +250,22 @@ def bundle(tmp_path_factory) -> Path:
     }
     (folder / "model.json").write_text(json.dumps(description))
     return folder
+
+
+@pytest.fixture(scope="session")
+def observed(service, drive_log, bundle, tmp_path_factory) -> dict:
+    """A job that was looked after: its document once it succeeded, with the id of the request that made it."""
+    folder = tmp_path_factory.mktemp("observed")
+    pack_log(drive_log, folder / "log.tar")
+    pack_bundle(bundle, folder / "model.zip")
+    model = service.upload((folder / "model.zip").read_bytes(), "model.zip", "model", name="observed").json()
+    drive = service.upload((folder / "log.tar").read_bytes() + bytes(512), "log.tar").json()
+    service.wait(f"/v1/models/{model['id']}", lambda document: document["state"] == "ready")
+    request = {"drive_id": drive["id"], "model": "observed", "preset": "fast"}
+    answer = service.http.post("/v1/jobs", json=request, headers={"X-Request-Id": "test-4711"})
+    job = service.wait_for_job(answer.json()["id"])
+    assert job["state"] == "succeeded", job
+    return job | {"request": answer.headers["x-request-id"]}
 
 
 @pytest.fixture(scope="session")
