@@ -5,8 +5,8 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hostile chaos bench bench-train bench-scaling load lint format setup setup-dev setup-trainer servers
-.PHONY: compose-check compose-chaos demo-model clean
+.PHONY: help demo test hostile fuzz-api chaos load bench bench-train bench-scaling bench-transfer
+.PHONY: lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,6 +25,9 @@ chaos: servers ## kill real processes and servers under running jobs; SCENARIO=n
 
 bench-scaling: servers ## the same scenes with one worker and with two, one thread each
 	$(RUN) python tests/load/scaling.py
+
+fuzz-api: servers ## send the API what its OpenAPI document allows and forbids; EXAMPLES=200 an operation take minutes
+	L3PS_FUZZ_EXAMPLES=$(or $(EXAMPLES),200) $(RUN) pytest -s --timeout 900 tests/contract/api/test_openapi_document.py
 
 lint: setup-dev
 	$(RUN) ruff check .

@@ -1,11 +1,10 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``, ``outputs``, ``retention``,
-``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``, ``keys``, ``requests`` (POSTs
-that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``.
-What changes states is in
-:mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
+``outputs``, ``retention``, ``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``,
+``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through
+``outbox``), ``webhooks``. What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import (

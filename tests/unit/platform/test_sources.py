@@ -68,7 +68,7 @@ def test_a_source_may_be_one_projects_alone_and_the_narrowest_counts():
     ],
 )
 def test_what_is_no_place(text):
-    with pytest.raises(ValueError, match="it|its|is no name"):
+    with pytest.raises(ValueError, match=r"it|its|is no name"):
         Reference.parse(text)
 
 
