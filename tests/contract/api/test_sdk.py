@@ -3,11 +3,14 @@
 import hashlib
 import json
 import os
+import queue
 import re
 import signal
 import subprocess
 import sys
 import tarfile
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -126,6 +129,7 @@ def test_events_of_a_job_come_with_their_documents(client, job):
     assert any(event.kind == "job.succeeded" and event.data["data"]["id"] == job["id"] for event in following)
 
 
+@pytest.mark.once
 def test_the_same_key_makes_one_job(client, job):
     settings = {"drive_id": job["drive"]["id"], "model": "colours", "idempotency_key": f"once-{job['id']}"}
     first, second = (client.jobs.create(**settings, preset="fast") for _ in range(2))
@@ -162,11 +166,13 @@ def test_a_job_that_is_running_has_no_labels(client, job):
         client.jobs.retry(job["id"])
 
 
+@pytest.mark.once
 def test_an_unknown_token_is_said_to_be(service):
     with Client(service.url, "l3ps_wrong") as stranger, pytest.raises(Unauthorized):
         stranger.me()
 
 
+@pytest.mark.once
 def test_projects_are_worlds_of_their_own(client, service, job):
     project = client.projects.create(f"sdk {job['id']}")
     with Client(service.url, service.token, project=project["id"]) as other:
@@ -182,27 +188,113 @@ def test_projects_are_worlds_of_their_own(client, service, job):
     client.projects.delete(project["id"])
 
 
-def test_webhooks_are_made_changed_and_deleted(client):
-    webhook = client.webhooks.create("https://example.com/hook", events=["job.*"], description="nightly")
-    assert webhook["secret"].startswith("whsec_")
-    assert client.webhooks.update(webhook["id"], enabled=False)["enabled"] is False
-    assert client.webhooks.rotate(webhook["id"], overlap_seconds=0)["secret"] != webhook["secret"]
+@pytest.fixture
+def receiver():
+    """A receiver of webhooks on loopback: its URL, and what arrives as (headers, body)."""
+    arrived: queue.Queue = queue.Queue()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self):
+            arrived.put((dict(self.headers), self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as http:
+        thread = threading.Thread(target=http.serve_forever, args=(0.02,))
+        thread.start()
+        yield f"http://127.0.0.1:{http.server_port}/hook", arrived
+        http.shutdown()
+        thread.join()
+
+
+@pytest.mark.once
+def test_what_the_service_delivers_the_client_verifies(client, receiver):
+    url, arrived = receiver
+    webhook = client.webhooks.create(url, events=["webhook.disabled"], description="nightly")
+    delivery = client.webhooks.test(webhook["id"])
+    headers, body = arrived.get(timeout=30)
+    event = l3ps_client.webhooks.verify(body, headers, webhook["secret"])
+    assert (event.id, event.kind) == (delivery["id"], "ping")
+
+    rotated = client.webhooks.rotate(webhook["id"], overlap_seconds=600)
+    assert client.webhooks.redeliver(webhook["id"], delivery["id"])["id"] == delivery["id"]
+    headers, body = arrived.get(timeout=30)
+    for secret in (webhook["secret"], rotated["secret"]):
+        assert l3ps_client.webhooks.verify(body, headers, secret).id == delivery["id"]
+    with pytest.raises(l3ps_client.webhooks.BadSignature):
+        l3ps_client.webhooks.verify(body + b" ", headers, rotated["secret"])
+    assert [one["id"] for one in client.webhooks.deliveries(webhook["id"])] == [delivery["id"]]
+    client.webhooks.delete(webhook["id"])
+
+
+@pytest.mark.once
+def test_webhooks_are_changed_and_deleted(client, receiver):
+    webhook = client.webhooks.create(receiver[0], events=["webhook.disabled"])
     assert client.webhooks.replay(webhook["id"], since="2026-01-01T00:00:00Z") == 0
-    assert list(client.webhooks.deliveries(webhook["id"])) == []
+    assert client.webhooks.update(webhook["id"], enabled=False)["enabled"] is False
     assert webhook["id"] in [one["id"] for one in client.webhooks.list()]
     client.webhooks.delete(webhook["id"])
     with pytest.raises(NotFound):
         client.webhooks.get(webhook["id"])
 
 
-def test_what_the_service_signs_the_client_verifies():
-    from l3ps_platform.webhooks import signing
+@pytest.mark.once
+def test_commands_for_keys_webhooks_drives_and_models(command, job, receiver):
+    def said(*words) -> dict:
+        code, out, err = command(*words, "--json")
+        assert code == 0, err
+        return json.loads(out)
 
-    secrets = [signing.new_secret(), signing.new_secret()]
-    body = '{"type":"job.succeeded","timestamp":"2026-11-23T12:00:00Z","data":{"name":"Straße"}}'.encode()
-    headers = signing.headers(secrets, "msg_1", 1_700_000_000, body)
-    for secret in secrets:
-        event = l3ps_client.webhooks.verify(body, headers, secret, tolerance=1e12)
-        assert (event.id, event.kind, event.data) == ("msg_1", "job.succeeded", {"name": "Straße"})
-    with pytest.raises(l3ps_client.webhooks.BadSignature):
-        l3ps_client.webhooks.verify(body + b" ", headers, secrets[0], tolerance=1e12)
+    assert said("whoami")["project"]["id"] == "prj_default"
+    key = said("keys", "create", "nightly", "--scope", "write")
+    assert key["secret"] and said("keys", "rotate", key["id"])["secret"] != key["secret"]
+    assert key["id"] in command("keys", "list")[1]
+    assert said("keys", "revoke", key["id"])["revoked"]
+    webhook = said("webhooks", "create", receiver[0], "--event", "webhook.disabled")
+    assert said("webhooks", "test", webhook["id"])["type"] == "ping"
+    receiver[1].get(timeout=30)
+    assert "ping" in command("webhooks", "deliveries", webhook["id"])[1]
+    assert said("webhooks", "replay", webhook["id"], "--since", "2026-01-01T00:00:00Z")["count"] == 0
+    assert webhook["id"] in command("webhooks", "list")[1]
+    assert said("webhooks", "delete", webhook["id"])["deleted"]
+    assert job["drive"]["id"] in command("drives", "list")[1]
+    assert "3 scans" in command("drives", "show", job["drive"]["id"])[1]
+    assert "colours" in command("models", "list")[1]
+    assert command("uploads", "list", "--state", "complete")[0] == 0
+    listed = said("jobs", "--drive", job["drive"]["id"], "--state", "succeeded")["items"]
+    assert job["id"] in [one["id"] for one in listed]
+    assert command("jobs", job["id"], "--follow")[0] == 0
+    code, _, err = command("jobs", job["id"], "--retry")
+    assert code == 2 and "succeeded" in err
+    assert command("jobs", "--cancel")[0] == command("jobs", job["id"], "--cancel", "--retry")[0] == 2
+
+
+@pytest.mark.once
+def test_download_takes_one_scan_or_one_archive(command, job, client, tmp_path):
+    scan = next(file["scan"] for file in client.labels.list(job["id"])["files"] if file.get("scan"))
+    code, out, err = command("download", job["id"], "--scan", scan, "--out", tmp_path / "one", "--json")
+    assert code == 0, err
+    assert all(Path(file).is_file() for file in json.loads(out)["files"])
+    code, _, err = command("download", job["id"], "--archive", "--out", tmp_path / "all.tar")
+    assert code == 0, err
+    assert tarfile.is_tarfile(tmp_path / "all.tar")
+    assert command("download", job["id"], "job_2", "--out", tmp_path)[0] == 2
+
+
+@pytest.mark.once
+def test_an_interrupted_upload_is_resumed_by_command(command, service, archive, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert command("uploads", "resume", archive)[0] == 2
+
+    def stop(done, total):
+        if done > 6 * MiB:
+            raise InterruptedError
+
+    with Client(service.url, service.token) as first, pytest.raises(InterruptedError):
+        first.drives.upload(archive, name="night", parallel=1, progress=stop)
+    code, out, err = command("uploads", "resume", archive, "--json")
+    assert code == 0, err
+    assert json.loads(out)["name"] == "night"
