@@ -120,8 +120,7 @@ def test_a_wait_hears_of_each_step_and_of_the_end(client, job):
     told = []
     last = client.jobs.wait(fresh["id"], timeout=120, progress=lambda job: told.append(job["state"]))
     assert last["state"] == told[-1] == "succeeded"
-    events = client.jobs.events(fresh["id"])
-    assert next(events).data["state"] == "succeeded"
+    assert [event.data["state"] for event in client.jobs.events(fresh["id"])] == ["succeeded"]
 
 
 def test_events_of_a_job_come_with_their_documents(client, job):

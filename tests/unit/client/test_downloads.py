@@ -140,6 +140,13 @@ def test_an_archive_is_shorter_by_now(tmp_path):
         assert names(tmp_path) == ["all.tar"] and (tmp_path / "all.tar").read_bytes() == b"short"
 
 
+def test_an_archive_tells_its_size_as_it_comes(tmp_path):
+    with store_of(**{"labels.tar": LARGE}) as store:
+        told = []
+        store.client.labels.archive("job_1", tmp_path / "all.tar", progress=lambda *bytes: told.append(bytes))
+        assert told[-1] == (len(LARGE),) * 2
+
+
 def test_a_damaged_file_is_fetched_again_and_then_refused(tmp_path):
     with store_of(a=b"0123") as store:
         listing = store.listing()
