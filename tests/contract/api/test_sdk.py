@@ -272,6 +272,16 @@ def test_commands_for_keys_webhooks_drives_and_models(command, job, receiver):
 
 
 @pytest.mark.once
+def test_a_log_in_a_bucket_is_named_and_not_uploaded(command, client, job):
+    """Whether the service may read the bucket is the service's to say; here it may not."""
+    code, _, err = command("submit", "s3://nobodys/morning", "--model", "colours")
+    assert (code, "nobodys" in err) == (2, True), err
+    with pytest.raises(l3ps_client.Refused, match="nobodys"):
+        client.rules.create("morning", bucket="nobodys", model="colours")
+    assert list(client.rules.list()) == []
+
+
+@pytest.mark.once
 def test_download_takes_one_scan_or_one_archive(command, job, client, tmp_path):
     scan = next(file["scan"] for file in client.labels.list(job["id"])["files"] if file.get("scan"))
     code, out, err = command("download", job["id"], "--scan", scan, "--out", tmp_path / "one", "--json")
