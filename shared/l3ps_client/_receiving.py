@@ -113,7 +113,7 @@ def _complete(wire: Wire, source: Source, partial: _Partial, count: Count) -> No
             return
         except (Unreachable, TooManyRequests) as error:
             attempt = 1 if partial.length > before else attempt + 1
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
+            asked = error.retry_after or 0.0
             if attempt > wire.retry.tries + 2 or asked > wire.retry.longest_wait:
                 raise
             time.sleep(max(asked, wire.retry.pause(attempt)))
@@ -122,6 +122,9 @@ def _complete(wire: Wire, source: Source, partial: _Partial, count: Count) -> No
 def _once(wire: Wire, source: Source, partial: _Partial, count: Count) -> None:
     if source.size is not None and partial.length == source.size:
         return
+    if not partial.etag:  # nothing tells whether other bytes would go with these
+        count.add(-partial.length)
+        partial.drop()
     asked = partial.length
     headers = {"Range": f"bytes={asked}-", "If-Range": partial.etag} if asked else {}
     with (
@@ -215,6 +218,8 @@ class _Partial:
                 if self._source.sha256 is not None:
                     self._digest.update(block)
                 self.length += len(block)
+                if self._source.size is not None and self.length > self._source.size:
+                    raise Damaged(f"{self.path.stem} is larger than announced and was removed. Try again.")
                 if not self.noted and self.length >= _RESUME_FROM and self.etag:
                     self.noted = True
                     self._etag_path.write_text(json.dumps({"etag": self.etag, "sha256": self._source.sha256}))

@@ -82,7 +82,7 @@ def follow(wire: Wire, stream: str, params: dict[str, Any], after: str | None) -
                         yield event
         except (Unreachable, TooManyRequests) as error:
             attempt += 1
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
+            asked = error.retry_after or 0.0
             if attempt > wire.retry.tries + 2 or asked > wire.retry.longest_wait:
                 raise
             time.sleep(max(asked, wire.retry.pause(attempt)))
@@ -97,9 +97,10 @@ def _occasions(wire: Wire, stream: str | None, deadline: float, poll: float) -> 
     """Each time that looking makes sense: now, when something happened, when the stream ended, at the deadline."""
     yield
     after: str | None = None
+    not_before = 0.0
     while True:
         left = max(deadline - time.monotonic(), 0.01)
-        if stream is None:
+        if stream is None or time.monotonic() < not_before:
             time.sleep(min(poll, left))
             yield
             continue
@@ -112,8 +113,7 @@ def _occasions(wire: Wire, stream: str | None, deadline: float, poll: float) -> 
                     yield
                     looked = time.monotonic()
         except (Unreachable, TooManyRequests) as error:
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
-            time.sleep(min(max(asked, POLL_SECONDS), left))
+            not_before = time.monotonic() + max(error.retry_after or 0.0, POLL_SECONDS)  # until then it is asked
         except Refused as error:
             if error.status not in _NO_EVENTS:
                 raise
