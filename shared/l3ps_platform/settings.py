@@ -6,12 +6,13 @@ The same code serves the embedded stack, one machine and a cluster; only the URL
 from __future__ import annotations
 
 from functools import lru_cache
+from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 MiB = 1024 * 1024
 GiB = 1024 * MiB
@@ -68,7 +69,26 @@ class Settings(BaseSettings):
     public_url: str = ""  # empty: http://host:port
     host: str = "127.0.0.1"
     port: int = 8080
-    token: SecretStr | None = None  # None: no authentication, for loopback only
+    # The operator's. None: on loopback whoever reaches the service is the operator, elsewhere only API keys get in.
+    token: SecretStr | None = None
+    trusted_proxies: str = ""  # addresses whose X-Forwarded-For is believed, comma-separated; empty: nobody's
+
+    # What one API key (or, without keys, one address) may ask: 200 clients that each ask once a second under one key
+    # must pass, with room for what else they do.
+    rate_per_second: float = Field(default=1000.0, gt=0)
+    rate_burst: int = Field(default=2000, ge=1)
+    # Wrong credentials from one address. Secrets hold 256 bits, so this is about load, not about guessing.
+    failures_per_second: float = Field(default=10.0, gt=0)
+    failures_burst: int = Field(default=20, ge=1)
+    # How long a process believes what it has read about a key. In the process that revokes one it ends at once.
+    key_cache_seconds: float = Field(default=2.0, ge=0)
+    max_open_uploads: int = Field(default=1000, ge=1)  # of a project
+    max_active_jobs: int = Field(default=1000, ge=1)  # of a project, trainings too
+
+    idempotency_seconds: float = Field(default=24 * 3600.0, gt=0)  # life of an Idempotency-Key
+    # How long a request with a key is waited for before it is taken for dead. Joining the parts of the largest upload
+    # takes seconds; one that takes longer and still lives cannot commit once another has taken over.
+    idempotency_lease_seconds: float = Field(default=60.0, gt=0)
 
     scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
     # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
@@ -96,9 +116,15 @@ class Settings(BaseSettings):
     heartbeat_seconds: float = 10.0
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
+    # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
+    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    outage_retry_seconds: float = 60.0
+    outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0
     # A queued stage without a claim for this long whose message is not in the queue is sent again.
     resend_seconds: float = 30.0
+    # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
+    cancel_seconds: float = 10.0
     # How long what nothing refers to stays in the store: half-made objects of dead processes, checkpoints of trainings
     # that failed. Long enough to look into a failure, and to go on with a training.
     orphan_seconds: float = 24 * 3600.0
@@ -109,8 +135,14 @@ class Settings(BaseSettings):
     # would deliver the message a second time.
     train_seconds: float = Field(default=20 * 3600.0, gt=0, lt=24 * 3600)
     progress_seconds: float = 0.5
+    # When Redis delivers a message again that nobody has acknowledged. Redelivery is no part of our recovery (leases
+    # are), so messages of long stages must not come back while they run: a task of 14 s under a visibility timeout of
+    # 5 s was started three times. Claims make that harmless, but each costs a look at the catalog.
+    visibility_seconds: int = Field(default=24 * 3600, gt=0)
 
     threads: int = 2  # of numeric libraries, per worker process
+    # Workers yield the processor to an API on the same machine, whose answers take milliseconds.
+    nice: int = Field(default=10, ge=0, le=19)
     concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
 
     # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping
@@ -124,9 +156,28 @@ class Settings(BaseSettings):
     backbones_dir: Path | None = None  # None: data_dir/backbones
     checkpoint_seconds: float = 30.0  # how often a training's checkpoint and log go to the object store
 
+    event_days: float = Field(default=30.0, gt=0)  # the event log and finished deliveries are kept for so long
+    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; one costs about 50 kB
+    # Networks that webhooks may reach though they are not public, e.g. 10.1.0.0/16,127.0.0.1/32; else a client could
+    # have the service call into its own network.
+    webhook_allow: Annotated[tuple[IPv4Network | IPv6Network, ...], NoDecode] = ()
+    webhook_http: bool = False  # whether webhooks may go without TLS
+    # The wait before each attempt; these are the specification's (standardwebhooks.com), over three days in all.
+    webhook_retry_seconds: Annotated[tuple[float, ...], NoDecode] = (
+        *(0.0, 5.0, 300.0, 1800.0),
+        *(hours * 3600.0 for hours in (2, 5, 10, 14, 20, 24)),
+    )
+    webhook_timeout_seconds: float = Field(default=15.0, gt=0)  # for an attempt as a whole; the specification: 15 to 30
+    webhook_disable_days: float = Field(default=5.0, gt=0)  # a webhook that took nothing for so long is switched off
+
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     log_format: Literal["json", "console"] = "json"
+
+    @field_validator("webhook_allow", "webhook_retry_seconds", mode="before")
+    @classmethod
+    def _listed(cls, value: object) -> object:
+        return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
     @field_validator("database_url")
     @classmethod
@@ -146,6 +197,11 @@ class Settings(BaseSettings):
         elif value and not value.startswith("file:///"):
             raise ValueError("the object store is file:///DIR or s3://KEY:SECRET@host:port/bucket")
         return value
+
+    @property
+    def loopback(self) -> bool:
+        """Whether the API is reached from this machine alone."""
+        return self.host in ("127.0.0.1", "localhost", "::1")
 
     @property
     def catalog_url(self) -> str:

@@ -7,9 +7,11 @@ line of the thread or request, also in lines of libraries that use the standard 
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import structlog
 
@@ -17,6 +19,8 @@ from l3ps_platform.settings import Settings
 
 # Chatty below WARNING, and nothing in it that our own lines do not say.
 _QUIET = ("urllib3", "kombu", "amqp", "celery.redirected", "alembic", "httpx", "httpcore")
+
+_SECRET = re.compile(r"(l3ps_key_[0-9a-z]{25}_)[A-Za-z0-9_-]{43}")
 
 
 def configure_logging(settings: Settings, service: str) -> None:
@@ -47,6 +51,7 @@ def configure_logging(settings: Settings, service: str) -> None:
         last += [
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
         ]
+    last.append(_without_secrets)
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=last))
     root = logging.getLogger()
@@ -61,6 +66,11 @@ def bound(**ids: str | int | None) -> Iterator[None]:
     """Put ids (``job``, ``scene``, ``stage`` …) into every line logged inside; None is left out."""
     with structlog.contextvars.bound_contextvars(**{name: id for name, id in ids.items() if id is not None}):
         yield
+
+
+def _without_secrets(_: object, __: str, line: Any) -> str:
+    """Leave the secret out of an API key, wherever a client has put one; the key's id stays."""
+    return _SECRET.sub(r"\1…", str(line))
 
 
 def _naming(service: str) -> structlog.types.Processor:

@@ -28,9 +28,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import l3ps_client
 from minio import Minio
 
+import l3ps_client
 from l3ps_cli.processes import ChildDiedError, Processes
 from l3ps_cli.stack import free_port
 from l3ps_platform.catalog import (
@@ -252,7 +252,7 @@ def answers(service: Service) -> bool:
 
 def say(text: str) -> None:
     """To the terminal."""
-    print(text, flush=True)  # noqa: T201
+    print(text, flush=True)
 
 
 if __name__ == "__main__":

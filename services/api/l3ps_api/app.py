@@ -12,20 +12,32 @@ from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
 from prometheus_client import CollectorRegistry
 
-from l3ps_api import errors, problems
+from l3ps_api import errors
 from l3ps_api.annotation_sets.routes import router as annotation_sets
-from l3ps_api.auth import authenticate
+from l3ps_api.auth import Gate, authenticate
+from l3ps_api.description import describe
 from l3ps_api.drives.routes import router as drives
+from l3ps_api.etags import ETags
+from l3ps_api.events.hub import EventHub
+from l3ps_api.events.routes import router as events
+from l3ps_api.idempotency import Idempotency
 from l3ps_api.jobs.routes import router as jobs
+from l3ps_api.keyring import Keyring
+from l3ps_api.keys import service as key_service
+from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
 from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
 from l3ps_api.models.routes import router as models
 from l3ps_api.objects.routes import router as objects
+from l3ps_api.operations import operations_of
+from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
+from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
@@ -33,6 +45,7 @@ from l3ps_platform.metrics import CatalogCollector
 from l3ps_platform.objects import open_store
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
+from l3ps_platform.webhooks import Deliverer
 from l3ps_platform.workflow import Reconciler
 
 log = structlog.get_logger(__name__)
@@ -47,6 +60,9 @@ Drive logs in, panoptic labels on every LiDAR point out.
 A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
 `GET /v1/trainings/{id}` shows progress, log and report.
 
+`GET /v1/jobs/{id}/events` follows a job as server-sent events, `GET /v1/events` all that happens; `POST /v1/webhooks`
+has a URL told.
+
 Every error is a problem document (RFC 9457) that names the field at fault and the remedy.
 """
 
@@ -60,24 +76,32 @@ def create_app(settings: Settings) -> FastAPI:
         title="l3ps", version=version("l3ps-api"), description=DESCRIPTION.strip(), lifespan=_lifespan, redoc_url=None
     )
     app.state.services = services
-    app.state.token = settings.token.get_secret_value() if settings.token else None
+    app.state.keyring = Keyring(settings, catalog)
+    app.state.events = EventHub(catalog)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention):
+    own = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention)
+    for router in (*own, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.
+    app.add_middleware(
+        Idempotency, services=services, operations=lambda: operations_of(app),
+        remade={"uploads": upload_service.opened, "api_keys": key_service.shown_again},
+    )  # fmt: skip
+    app.add_middleware(ETags)
+    app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
     app.add_middleware(BodyLimit, exempt="/v1/objects/")
-    loopback = settings.host in ("127.0.0.1", "localhost", "::1")
-    if loopback and not settings.public_url:
+    app.add_middleware(errors.Problems)
+    if settings.loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
-    if not loopback and app.state.token is None:
-        log.warning("anyone who reaches this address may use the service: set L3PS_TOKEN", host=settings.host)
+    if not settings.loopback and settings.token is None:
+        log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
-    problems.describe_in_openapi(app)
+    describe(app)
     return app
 
 
@@ -92,12 +116,19 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         log.warning("object store not reached at the start, /readyz tries again", reason=str(error))
     stop = threading.Event()
     reconciler = Reconciler(services.catalog, services.queue, services.store, services.settings)
-    broom = threading.Thread(target=reconciler.run, args=(stop,), name="reconciler", daemon=True)
-    broom.start()
+    deliverer = Deliverer(services.catalog, services.settings)
+    chores = [
+        threading.Thread(target=run, args=(stop,), name=name, daemon=True)
+        for name, run in (("reconciler", reconciler.run), ("deliverer", deliverer.run))
+    ]
+    for chore in chores:
+        chore.start()
     try:
         yield
     finally:
         stop.set()
-        await run_in_threadpool(broom.join, 10)
+        app.state.events.close()
+        for chore in chores:
+            await run_in_threadpool(chore.join, 10)
         services.catalog.dispose()
         services.queue.close()

@@ -15,7 +15,8 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from l3ps.errors import InputError
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, conflict, items, unavailable, unknown
+from l3ps_api.operations import operations_of
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, fault, items, too_large, unavailable, unknown
 from l3ps_platform.errors import (
     CatalogUnavailable,
     Conflict,
@@ -30,20 +31,22 @@ from l3ps_platform.errors import (
 
 log = structlog.get_logger(__name__)
 Handler = Callable[[Request, Any], Awaitable[JSONResponse]]
+_NEW_URL = "Ask the API for a new URL."
 
 
 def install(app: FastAPI) -> None:
     """Register the handlers; to be called before other middleware is added, which then sees these answers."""
-    app.add_middleware(UnexpectedErrors)
+    app.add_middleware(Problems)
     for kind, translate in _TRANSLATIONS:
         app.add_exception_handler(kind, _handler(translate))
 
 
-class UnexpectedErrors:
-    """Answers with a problem document where nothing else caught an exception, and logs it once.
+class Problems:
+    """Answers with a problem document to what nothing further in has caught; logs what nobody expected.
 
-    A handler for ``Exception`` would not do: Starlette raises it again after the answer, upon which the server closes
-    the connection under a client that may already be sending its next request.
+    Innermost it stands in for a handler of ``Exception``: after that one's answer Starlette raises the exception again,
+    upon which the server closes the connection under a client that may already be sending its next request. Around
+    other middleware it turns into answers what that raises.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -62,10 +65,17 @@ class UnexpectedErrors:
         except Exception as error:
             if started or scope["type"] != "http":
                 raise
-            log.error("request failed", method=scope["method"], path=scope["path"], exc_info=error)
-            detail = "The service failed at this request; the fault is in the service. Its log says more."
-            problem = ApiProblem(500, "internal", "Internal error", detail)
+            problem = _problem(Request(scope), error)
             await answer(problem, scope["path"])(scope, receive, send)
+
+
+def _problem(request: Request, error: Exception) -> ApiProblem:
+    for kind, translate in _TRANSLATIONS:
+        if isinstance(error, kind):
+            return translate(request, error)
+    log.error("request failed", method=request.method, path=request.url.path, exc_info=error)
+    what, remedy = "the fault is in the service, not in the request", "Its log says more."
+    return fault(500, "internal", "Internal error", "service", what, remedy)
 
 
 def _handler(translate: Callable[[Request, Any], ApiProblem]) -> Handler:
@@ -100,23 +110,29 @@ def _field_error(fault: dict[str, Any]) -> ErrorItem:
         return ErrorItem(where=where, what="the field is missing", remedy="Add it.")
     if kind == "extra_forbidden":
         return ErrorItem(where=where, what="there is no such field", remedy="Remove it or correct its name.")
+    if kind == "malformed_cursor":
+        return ErrorItem(where=where, what=what, remedy="Send `next` of the page before.")
     return ErrorItem(where=where, what=what, remedy="/openapi.json says what this field takes.")
 
 
 def _http_error(request: Request, error: HTTPException) -> ApiProblem:
     status = HTTPStatus(error.status_code)
     path = request.url.path
-    detail = str(error.detail)
-    errors = []
-    if status == HTTPStatus.NOT_FOUND:
-        detail = f"There is nothing at {path}. /openapi.json lists every path."
-        errors = [ErrorItem(where="path", what=f"{path} does not exist", remedy="Use a path of /openapi.json.")]
-    elif status == HTTPStatus.METHOD_NOT_ALLOWED:
-        allowed = (error.headers or {}).get("Allow", "another method")
-        detail = f"{request.method} does not work on {path}; it takes {allowed}."
-        errors = [ErrorItem(where="method", what=f"{request.method} is not allowed", remedy=f"Use {allowed}.")]
     code = status.phrase.lower().replace(" ", "-")
-    return ApiProblem(status, code, status.phrase, detail, errors, headers=error.headers)
+    headers = dict(error.headers or {})
+    if status == HTTPStatus.NOT_FOUND:
+        what, remedy = f"there is nothing at {path}", "Use a path of /openapi.json."
+        return fault(status, code, status.phrase, "path", what, remedy, headers)
+    if status == HTTPStatus.METHOD_NOT_ALLOWED:
+        # Starlette names the methods of the first route that has the path; there may be several.
+        methods = sorted(operations_of(request.app).at(path)) or headers.get("Allow", "GET").split(", ")
+        headers["Allow"] = allowed = ", ".join(methods)
+        what, remedy = f"{request.method} does not work on {path}", f"It takes {allowed}."
+        return fault(status, code, status.phrase, "method", what, remedy, headers)
+    if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:
+        what, _, remedy = str(error.detail).partition(". ")
+        return too_large("body", what, remedy)
+    return ApiProblem(status, code, status.phrase, str(error.detail), headers=headers)
 
 
 def _bad_input(_: Request, error: InputError) -> ApiProblem:
@@ -129,19 +145,20 @@ def _not_found(request: Request, error: NotFound) -> ApiProblem:
 
 
 def _conflict(_: Request, error: Conflict) -> ApiProblem:
-    return conflict("conflict", "Not possible in the present state", _sentence(error))
+    what, remedy = _parted(error, "GET it to see why.")
+    return fault(409, "conflict", "Not possible in the present state", "state", what, remedy)
 
 
 def _forbidden(_: Request, error: InvalidSignature | InvalidKey) -> ApiProblem:
-    return ApiProblem(403, "invalid-signature", "The URL does not permit this", _sentence(error))
+    return fault(403, "invalid-signature", "The URL does not permit this", "url", *_parted(error, _NEW_URL))
 
 
 def _no_object(_: Request, error: ObjectMissing) -> ApiProblem:
-    return ApiProblem(404, "unknown-object", "Unknown object", f"{_sentence(error)} Ask the API for a new URL.")
+    return fault(404, "unknown-object", "Unknown object", "url", *_parted(error, _NEW_URL))
 
 
 def _upload_error(_: Request, error: UploadError) -> ApiProblem:
-    return ApiProblem(409, "upload-closed", "The upload is closed", _sentence(error))
+    return fault(409, "upload-closed", "The upload is closed", "upload", *_parted(error, "Begin a new one."))
 
 
 def _down(what: str) -> Callable[[Request, Exception], ApiProblem]:
@@ -152,9 +169,10 @@ def _down(what: str) -> Callable[[Request, Exception], ApiProblem]:
     return translate
 
 
-def _sentence(error: Exception) -> str:
-    text = str(error)
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+def _parted(error: Exception, remedy: str) -> tuple[str, str]:
+    """What is wrong and what to do: the platform's messages have a colon between them."""
+    what, _, given = str(error).partition(": ")
+    return what, f"{given[:1].upper()}{given[1:].rstrip('.')}." if given else remedy
 
 
 _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]], ...] = (

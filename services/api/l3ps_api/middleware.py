@@ -8,7 +8,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from l3ps_api.problems import ApiProblem, answer, too_large
+from l3ps_api.problems import answer, fault, too_large
 
 JSON_BODY_BYTES = 2 << 20
 """The largest JSON body taken: the completion of an upload of 10,000 parts is below 1 MB."""
@@ -62,13 +62,9 @@ class LoopbackHosts:
             host = next((value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), "")
             name = host if host.endswith("]") else host.rpartition(":")[0] or host
             if name.lower() not in _LOOPBACK:
-                problem = ApiProblem(
-                    421,
-                    "foreign-host",
-                    "Wrong host name",
-                    f"This service listens on the loopback interface and does not answer to the name {name!r}. "
-                    "Use 127.0.0.1 or localhost, or start it with L3PS_HOST set to the address it is to serve.",
-                )
+                what = f"this service listens on the loopback interface and does not answer to the name {name!r}"
+                remedy = "Use 127.0.0.1 or localhost, or start it with L3PS_HOST set to the address it is to serve."
+                problem = fault(421, "foreign-host", "Wrong host name", "Host", what, remedy)
                 await answer(problem, scope["path"])(scope, receive, send)
                 return
         await self.app(scope, receive, send)
@@ -97,7 +93,7 @@ class BodyLimit:
             message = await receive()
             received += len(message.get("body", b""))
             if received > JSON_BODY_BYTES:
-                raise HTTPException(413, f"body: {what}. {remedy}")
+                raise HTTPException(413, f"{what}. {remedy}")  # FastAPI lets no other exception through here
             return message
 
         await self.app(scope, limited, send)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 
@@ -44,8 +43,8 @@ class ApiProblem(Exception):  # noqa: N818  (it becomes a problem document)
         status: HTTP status.
         code: stable name in kebab-case, the end of the document's ``type``.
         title: the kind of problem.
-        detail: what happened and what to do.
-        errors: the single faults, where there are several or a field is to be named.
+        detail: what happened and, in its last sentence, what to do.
+        errors: the single faults with the fields they are about; without them the detail stands for the one.
         headers: further response headers.
     """
 
@@ -61,8 +60,21 @@ class ApiProblem(Exception):  # noqa: N818  (it becomes a problem document)
     ) -> None:
         super().__init__(detail)
         self.status, self.code, self.title, self.detail = status, code, title, detail
-        self.errors = list(errors)
+        self.errors = list(errors) or [_from_detail(detail)]
         self.headers = dict(headers or {})
+
+
+def _from_detail(detail: str) -> ErrorItem:
+    what, _, remedy = detail.rpartition(". ")
+    return ErrorItem(where="request", what=what or detail, remedy=remedy if what else "See /openapi.json.")
+
+
+def fault(
+    status: int, code: str, title: str, where: str, what: str, remedy: str, headers: Mapping[str, str] | None = None
+) -> ApiProblem:
+    """A problem with one fault: ``where`` it is, ``what`` is wrong and the remedy."""
+    error = ErrorItem(where=where, what=what, remedy=remedy)
+    return ApiProblem(status, code, title, f"{where}: {what}. {remedy}", [error], headers=headers)
 
 
 def items(problems: Iterable[Problem]) -> list[ErrorItem]:
@@ -88,32 +100,27 @@ def unknown(kind: str, identifier: str, where: str = "path") -> ApiProblem:
 
 
 def conflict(code: str, title: str, detail: str, *, where: str = "", remedy: str = "") -> ApiProblem:
-    """409: the request is sound but not in the present state of things."""
+    """409: the request is sound but not in the present state of things; ``detail`` ends with what to do."""
     errors = [ErrorItem(where=where, what=detail, remedy=remedy)] if where else []
     return ApiProblem(409, code, title, detail, errors)
 
 
 def invalid(where: str, what: str, remedy: str, *, code: str = "invalid-request") -> ApiProblem:
     """422 that names one field."""
-    error = ErrorItem(where=where, what=what, remedy=remedy)
-    return ApiProblem(422, code, "The request cannot be used", f"{where}: {what}. {remedy}", [error])
+    return fault(422, code, "The request cannot be used", where, what, remedy)
 
 
 def too_large(where: str, what: str, remedy: str) -> ApiProblem:
     """413."""
-    error = ErrorItem(where=where, what=what, remedy=remedy)
-    return ApiProblem(413, "too-large", "Too large", f"{where}: {what}. {remedy}", [error])
+    return fault(413, "too-large", "Too large", where, what, remedy)
 
 
 def unavailable(what: str, seconds: int = 5) -> ApiProblem:
     """503 for a catalog, store or queue that does not answer."""
-    return ApiProblem(
-        503,
-        f"{what.replace(' ', '-')}-unavailable",
-        "Temporarily unavailable",
-        f"The {what} does not answer just now; nothing was changed. Try again in {seconds} seconds.",
-        headers={"Retry-After": str(seconds)},
-    )
+    code, remedy = f"{what.replace(' ', '-')}-unavailable", f"Try again in {seconds} seconds."
+    detail = f"The {what} does not answer just now; nothing was changed. {remedy}"
+    error = ErrorItem(where=what, what="it does not answer just now", remedy=remedy)
+    return ApiProblem(503, code, "Temporarily unavailable", detail, [error], headers={"Retry-After": str(seconds)})
 
 
 def answer(problem: ApiProblem, instance: str) -> JSONResponse:
@@ -129,26 +136,3 @@ def answer(problem: ApiProblem, instance: str) -> JSONResponse:
     return JSONResponse(
         document.model_dump(exclude_none=True), problem.status, headers=problem.headers, media_type=MEDIA_TYPE
     )
-
-
-def describe_in_openapi(app: FastAPI) -> None:
-    """Make every operation of ``/openapi.json`` name the problem document as its error answer."""
-    generate = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            schema = generate()
-            schemas = schema.setdefault("components", {}).setdefault("schemas", {})
-            for name in ("HTTPValidationError", "ValidationError"):
-                schemas.pop(name, None)
-            document = ProblemDocument.model_json_schema(ref_template="#/components/schemas/{model}")
-            schemas |= document.pop("$defs")
-            schemas["ProblemDocument"] = document
-            content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}}
-            for operations in schema["paths"].values():
-                for operation in operations.values():
-                    operation["responses"].pop("422", None)
-                    operation["responses"]["default"] = {"description": "Any error.", "content": content}
-        return app.openapi_schema or schema
-
-    app.openapi = openapi  # type: ignore[method-assign]

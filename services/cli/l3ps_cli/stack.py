@@ -1,6 +1,7 @@
 """The embedded stack: Redis, API and workers as children of this process, all data in one directory.
 
-DATA/up.json      url, token and pid of the running stack; absent while none runs
+DATA/up.json      url, token and pid of the running stack, for its owner's eyes alone; absent while none runs
+DATA/token        the operator's token, made at the first start, for its owner's eyes alone
 DATA/lock         held by the running stack; the kernel lets go of it however the stack ends
 DATA/catalog.db   the catalog (SQLite, WAL)
 DATA/objects/     drive logs, stage outputs, labels, models
@@ -58,7 +59,8 @@ class StackOptions:
         port: port of the API on the loopback interface, 0 for any free one.
         workers: worker processes.
         threads: threads each worker process may use.
-        token: bearer token the API demands, None for none.
+        token: the operator's token; None takes the one of the data directory, made when absent.
+        open: demand no token: whoever reaches the loopback interface of this machine is the operator.
         training: start a worker that trains models, where the trainer is installed.
     """
 
@@ -67,6 +69,7 @@ class StackOptions:
     workers: int = 1
     threads: int = 2
     token: str | None = None
+    open: bool = False
     training: bool = False
 
     @property
@@ -84,6 +87,7 @@ class Stack:
         self.logs = self.data / "logs"
         self.processes = Processes(self.logs)
         self.url = ""
+        self.token: str | None = None
         self._say = say
         self._cleanup = ExitStack()
 
@@ -91,10 +95,10 @@ class Stack:
         with ExitStack() as undo:
             undo.enter_context(self._lock())
             undo.enter_context(self.processes)
+            self.token = None if self.options.open else self.options.token or kept_token(self.data)
             self._start()
-            (self.data / "up.json").write_text(
-                json.dumps({"url": self.url, "token": self.options.token, "pid": os.getpid()}) + "\n"
-            )
+            note = {"url": self.url, "token": self.token, "pid": os.getpid()}
+            _write_secret(self.data / "up.json", json.dumps(note) + "\n")
             undo.callback((self.data / "up.json").unlink, missing_ok=True)
             self._cleanup = undo.pop_all()
         return self
@@ -179,8 +183,8 @@ class Stack:
         }
         env.setdefault("L3PS_LOG_FORMAT", "console")
         env.pop("L3PS_TOKEN", None)
-        if self.options.token:
-            env["L3PS_TOKEN"] = self.options.token
+        if self.token:
+            env["L3PS_TOKEN"] = self.token
         return env
 
     def _api_ready(self) -> bool:
@@ -208,6 +212,26 @@ def _port_is_free(port: int) -> bool:
         except OSError:
             return False
     return True
+
+
+def kept_token(data: Path) -> str:
+    """The operator's token of a data directory; 256 random bits, made and written down when absent."""
+    path = data / "token"
+    with suppress(FileNotFoundError):
+        if kept := path.read_text().strip():
+            return kept
+    token = secrets.token_urlsafe(32)
+    _write_secret(path, token + "\n")
+    return token
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """A whole file that only its owner may read, from its first moment."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.unlink(missing_ok=True)
+    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(text)
+    draft.replace(path)
 
 
 def running_stack(data: Path) -> dict[str, Any] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,16 +58,25 @@ def up(
     workers: Annotated[int, typer.Option(min=0, help="Worker processes; 0 for one per two cores.")] = 0,
     threads: Annotated[int, typer.Option(min=1, max=256, help="Threads each worker process may use.")] = 2,
     token: Annotated[
-        str | None, typer.Option(help="Bearer token the API demands.", envvar="L3PS_TOKEN", show_default=False)
+        str | None,
+        typer.Option(
+            help="The operator's token; default: the one in DATA/token, made at the first start.",
+            envvar="L3PS_TOKEN",
+            show_default=False,
+        ),
     ] = None,
+    no_token: Annotated[
+        bool, typer.Option("--no-token", help="Ask for none: whoever is on this machine may use it.")
+    ] = False,
     logs: Annotated[bool, typer.Option("--logs", help="Show what the services log.")] = False,
 ) -> None:
     """Run the service on this machine: Redis, API and workers, all data in one directory. Ctrl-C stops it."""
     count = workers or max(1, (os.cpu_count() or 1) // threads)
-    options = StackOptions(data.expanduser(), port, count, threads, token or None, training=True)
+    options = StackOptions(data.expanduser(), port, count, threads, token or None, open=no_token, training=True)
     try:
         with stop_on_signals(), clear_errors(), Stack(options, lambda step: err.print(f"[dim]{step}[/dim]")) as stack:
             out.print(f"l3ps is up at {stack.url}  (data: {stack.data}, logs: {stack.logs})", highlight=False)
+            out.print(_access(stack), markup=False, highlight=False, soft_wrap=True)
             out.print("Ctrl-C stops it.")
             follow = _Follower(stack.logs) if logs else None
             while True:
@@ -80,6 +90,15 @@ def up(
         fail(f"{error}. Everything else was stopped too. Its last lines:\n{error.last_lines}", JOB_FAILED)
     except (StackError, TimeoutError) as error:
         fail(str(error), JOB_FAILED)
+
+
+def _access(stack: Stack) -> str:
+    """How to get in: to paste, where a person reads it; without the secret, where it may end in a log."""
+    if stack.token is None:
+        return "It asks for no token: whoever is on this machine may use it."
+    if sys.stdout.isatty():
+        return f"Commands on this machine find it. Elsewhere: export L3PS_URL={stack.url} L3PS_TOKEN={stack.token}"
+    return f"Commands on this machine find it by {stack.data / 'up.json'}, which holds its token."
 
 
 class _Follower:

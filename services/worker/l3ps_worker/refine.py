@@ -109,7 +109,8 @@ def _done(
         workflow.complete(tx, claim, cost, output_key=key, quality=quality)
         workflow.note_output(tx, key.rpartition("/")[0], sum(file["size"] for file in manifest["files"]))
 
-    return Done(finish, work.scene.scans, work.scene.points, cached=cached, steps=steps or {})
+    stored = sum(file["size"] for file in manifest["files"])
+    return Done(finish, work.scene.scans, work.scene.points, stored, cached=cached, steps=steps or {})
 
 
 def _primal(context: Context, work: SceneWork, folder: Path) -> list[ScanLabels]:

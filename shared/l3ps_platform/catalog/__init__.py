@@ -2,7 +2,9 @@
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
 ``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``outputs``, ``retention``,
-``belongings`` (whose an object is), ``figures`` (sums for the metrics). What changes states is in
+``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``, ``keys``, ``requests`` (POSTs
+that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``.
+What changes states is in
 :mod:`l3ps_platform.workflow`.
 """
 
@@ -11,15 +13,25 @@ from l3ps_platform.catalog import (
     belongings,
     bundles,
     drives,
+    events,
     figures,
     jobs,
+    keys,
     outputs,
+    projects,
+    quotas,
+    requests,
     retention,
     stages,
     trainings,
     uploads,
+    webhooks,
 )
+from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
+from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
+from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
+from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -37,6 +49,7 @@ from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, Retention
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -51,21 +64,30 @@ __all__ = [
     "DEFAULT_PROJECT",
     "QUEUE_OF",
     "AnnotationsRow",
+    "ApiKeyRow",
+    "AttemptRow",
     "Base",
     "Catalog",
+    "DeliveryRow",
+    "DeliveryState",
     "DriveRow",
     "DriveState",
+    "EventKind",
+    "EventRow",
     "JobRow",
     "JobState",
     "Json",
+    "ModelFiguresRow",
     "ModelRow",
     "ModelState",
+    "Outcome",
     "OutputRow",
     "OutputState",
     "OutputUseRow",
     "Owned",
     "ProjectRow",
     "QueueName",
+    "RequestRow",
     "RetentionRow",
     "SceneRow",
     "Sender",
@@ -78,15 +100,22 @@ __all__ = [
     "Transaction",
     "UploadRow",
     "UploadState",
+    "WebhookRow",
     "annotation_sets",
     "belongings",
     "bundles",
     "drives",
+    "events",
     "figures",
     "jobs",
+    "keys",
     "outputs",
+    "projects",
+    "quotas",
+    "requests",
     "retention",
     "stages",
     "trainings",
     "uploads",
+    "webhooks",
 ]

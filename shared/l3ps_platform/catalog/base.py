@@ -11,6 +11,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Mapped, declared_attr, mapped_column
 
 from l3ps_platform.catalog.states import (
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -77,6 +78,7 @@ class Base(DeclarativeBase):
         StageName: _states(StageName),
         OutputState: _states(OutputState),
         QueueName: _states(QueueName),
+        DeliveryState: _states(DeliveryState),
     }
 
 

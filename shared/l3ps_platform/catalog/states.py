@@ -73,6 +73,14 @@ class OutputState(StrEnum):
     DOOMED = "doomed"
 
 
+class DeliveryState(StrEnum):
+    """The life of a webhook's delivery; a failed one can be replayed."""
+
+    PENDING = "pending"
+    DELIVERED = "delivered"
+    FAILED = "failed"
+
+
 class StageName(StrEnum):
     """What a stage does."""
 

@@ -49,6 +49,12 @@ class Service:
     def url(self) -> str:
         return str(self.http.base_url).rstrip("/")
 
+    @property
+    def token(self) -> str:
+        """The operator's."""
+        assert self.settings.token is not None
+        return self.settings.token.get_secret_value()
+
     def announce(self, size: int, filename: str = "log.tar", kind: str = "drive") -> dict:
         answer = self.http.post("/v1/uploads", json={"kind": kind, "filename": filename, "size": size})
         assert answer.status_code == 201, answer.text
@@ -112,6 +118,7 @@ class Service:
         assert document["status"] == status
         assert document["instance"] == answer.request.url.path
         assert document["title"] and document["detail"]
+        assert document["errors"], "every problem names what is at fault"
         for error in document["errors"]:
             assert error["where"] and error["what"] and error["remedy"]
         return document
@@ -136,7 +143,7 @@ def _embedded(request, data) -> Iterator[Settings]:
         for name, value in TUNING.items():
             patch.setenv(name, value)
         with Stack(StackOptions(data, port=0, training=True)) as stack:
-            yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]))
+            yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]), token=stack.token)
 
 
 @contextmanager
@@ -150,10 +157,12 @@ def _servers(request, data) -> Iterator[Settings]:
         objects_url=f"s3://{minio}/l3ps-{secrets.token_hex(4)}?secure=0",
         redis_url=redis.removesuffix("/0") + "/1",  # its worker takes every message, other tests' too
         port=free_port(),
+        token=secrets.token_urlsafe(32),
     )
     env = os.environ | TUNING | {"L3PS_TRAINING": "1"}
     for name in ("data_dir", "database_url", "objects_url", "redis_url", "port"):
         env[f"L3PS_{name.upper()}"] = str(getattr(settings, name))
+    env["L3PS_TOKEN"] = settings.token.get_secret_value()
     upgrade(settings.catalog_url)
     with Processes(data / "logs") as processes:
         processes.start("api", [sys.executable, "-m", "l3ps_api"], env)
@@ -173,7 +182,8 @@ def _ready(url: str) -> bool:
 @contextmanager
 def _looked_into(settings: Settings) -> Iterator[Service]:
     catalog = Catalog(settings.catalog_url).scoped(DEFAULT_PROJECT)
-    with httpx.Client(base_url=settings.api_url, timeout=30) as http:
+    credentials = {"Authorization": f"Bearer {settings.token.get_secret_value()}"}
+    with httpx.Client(base_url=settings.api_url, headers=credentials, timeout=30) as http:
         yield Service(http, catalog, open_store(settings), settings)
     catalog.dispose()
 
@@ -183,7 +193,8 @@ def command(service):
     """Runs a command of the CLI against the service; returns (exit code, standard output, standard error)."""
 
     def run(*words) -> tuple[int, str, str]:
-        result = CliRunner().invoke(app, [str(word) for word in words], env={"L3PS_URL": service.url, "L3PS_TOKEN": ""})
+        env = {"L3PS_URL": service.url, "L3PS_TOKEN": service.token}
+        result = CliRunner().invoke(app, [str(word) for word in words], env=env)
         if result.exception and not isinstance(result.exception, SystemExit):
             raise result.exception
         return result.exit_code, result.stdout, result.stderr

@@ -97,8 +97,13 @@ def assert_nothing_left(data: Path, pids: set[int], url: str) -> None:
 def test_a_killed_up_leaves_no_process_and_the_next_one_goes_on_with_its_data_until_ctrl_c(up):
     killed = up()
     url = killed.wait_until_up()
-    assert json.loads((killed.data / "up.json").read_text()) == {"url": url, "token": None, "pid": killed.process.pid}
-    upload = httpx.post(f"{url}/v1/uploads", json={"kind": "drive", "filename": "a.tar", "size": 9}).json()
+    note = json.loads((killed.data / "up.json").read_text())
+    assert note == {"url": url, "token": (killed.data / "token").read_text().strip(), "pid": killed.process.pid}
+    assert {path.stat().st_mode & 0o777 for path in (killed.data / "up.json", killed.data / "token")} == {0o600}
+    assert httpx.get(f"{url}/v1/drives").status_code == 401, "also on loopback"
+    announced = {"kind": "drive", "filename": "a.tar", "size": 9}
+    credentials = {"authorization": f"Bearer {note['token']}"}
+    upload = httpx.post(f"{url}/v1/uploads", json=announced, headers=credentials).json()
     pids = killed.wait_for_a_worker_child()
     killed.process.kill()
     killed.process.communicate()
@@ -121,8 +126,22 @@ def test_a_killed_up_leaves_no_process_and_the_next_one_goes_on_with_its_data_un
     code, out, err = stack.end()
     assert code == 0, err
     assert "l3ps has stopped." in out
+    assert "s3cret" not in out, "standard output is no terminal here"
     assert_nothing_left(stack.data, pids, url)
     assert not (stack.data / "up.json").exists()
+
+
+def test_a_token_is_made_once_and_asked_for_unless_told_otherwise(up):
+    unasked = up("--no-token", "--workers", "1")
+    url = unasked.wait_until_up()
+    assert json.loads((unasked.data / "up.json").read_text())["token"] is None
+    assert httpx.get(f"{url}/v1/me").json() == {
+        "project": {"id": "prj_default", "name": "default"},
+        "scope": "admin",
+        "key": None,
+    }
+    wrong = httpx.get(f"{url}/v1/me", headers={"authorization": "Bearer something"})
+    assert wrong.status_code == 401, "credentials that come must be right"
 
 
 def test_when_a_part_dies_the_rest_is_stopped_and_the_part_named(up):

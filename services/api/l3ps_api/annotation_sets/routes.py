@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 
 from l3ps_api.annotation_sets import service
 from l3ps_api.annotation_sets.schemas import Annotations, AnnotationsPage
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 
 router = APIRouter(prefix="/v1/annotations", tags=["training"])
 
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/v1/annotations", tags=["training"])
 def list_annotations(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("ann")] = None,
     sha256: Annotated[str | None, Query(description="Only archives of these bytes.", max_length=64)] = None,
 ) -> AnnotationsPage:
     """Annotations, newest first. New ones come as an upload of kind `annotations`."""

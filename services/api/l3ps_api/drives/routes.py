@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 
 from l3ps_api.drives import service
 from l3ps_api.drives.schemas import Drive, DrivePage
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 
 router = APIRouter(prefix="/v1/drives", tags=["drives"])
 
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/v1/drives", tags=["drives"])
 def list_drives(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("drv")] = None,
     sha256: Annotated[str | None, Query(description="Only archives of these bytes.", max_length=64)] = None,
 ) -> DrivePage:
     """Drives, newest first."""

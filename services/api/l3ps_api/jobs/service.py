@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 
 from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
+from l3ps_api.limits import over_quota
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
-from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, stages
-from l3ps_platform.workflow import cancel_job, submit_job
+from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
+from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -24,6 +26,7 @@ def create(services: Services, request: JobRequest) -> Job:
     """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
     try:
         with services.catalog.transaction() as tx:
+            check_active_jobs(services, tx.session)
             job = submit_job(tx, **request.model_dump())
     except InputError as error:
         found = error.problems
@@ -37,10 +40,17 @@ def create(services: Services, request: JobRequest) -> Job:
     return get(services, job.id)
 
 
-def page(services: Services, limit: int, cursor: str | None, state: JobState | None) -> JobPage:
+def check_active_jobs(services: Services, session: Session) -> None:
+    """429 where the project has as many jobs and trainings under way as it may; a few more when asked in parallel."""
+    limit = services.settings.max_active_jobs
+    if quotas.active_jobs(session) >= limit:
+        raise over_quota("jobs", limit, "jobs and trainings under way", "Wait for some to end, or cancel them.")
+
+
+def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted) -> JobPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
-        rows = jobs.page(session, limit=limit + 1, before=cursor, state=state)
+        rows = jobs.page(session, wanted, limit=limit + 1, before=cursor)
         shown = rows[:limit]
         of_drive = drives.many(session, [row.drive_id for row in shown])
         of_model = bundles.many(session, [row.model_id for row in shown])
@@ -59,7 +69,14 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
 def get(services: Services, job_id: str) -> Job:
     """One job in full. NotFound."""
     with services.catalog.reading() as session:
-        return _document(session, jobs.get(session, job_id))
+        return _document(session, job_id)
+
+
+def encoded(services: Services, job_id: str) -> bytes:
+    """The same as JSON, made anew only when something has changed. NotFound."""
+    with services.catalog.reading() as session:
+        revision = jobs.revision(session, job_id)
+        return services.documents.get(job_id, revision, lambda: _document(session, job_id).model_dump_json().encode())
 
 
 def cancel(services: Services, job_id: str) -> Job:
@@ -69,24 +86,35 @@ def cancel(services: Services, job_id: str) -> Job:
     return get(services, job_id)
 
 
+def retry(services: Services, job_id: str) -> Job:
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    with services.catalog.reading() as session:
+        wanted = outputs_to_keep(session, job_id)
+    gone = [key for key in wanted if not services.store.exists(key)]
+    with services.catalog.transaction() as tx:
+        retry_job(tx, job_id, gone)
+    return get(services, job_id)
+
+
 def delete(services: Services, job_id: str) -> None:
     """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
     with services.catalog.transaction() as tx:
         jobs.delete(tx, job_id)
 
 
-def _document(session: Session, job: JobRow) -> Job:
-    planned = stages.of_job(session, job.id)
-    ingest = stages.ingest_of(session, drive_id=job.drive_id)
-    rows = [ingest, *planned] if ingest is not None else planned
+def _document(session: Session, job_id: str) -> Job:
+    job, drive, model = jobs.with_inputs(session, job_id)
+    rows = stages.of_job_and_drive(session, job.id, job.drive_id)
+    planned = [row for row in rows if row.job_id == job.id]
     steps = stages.steps(session, [row.id for row in rows])
-    drive = drives.many(session, [job.drive_id])[job.drive_id]
-    model = bundles.many(session, [job.model_id])[job.model_id]
     done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
         return [stage_document(row, steps[row.id]) for row in chosen]
 
+    of_scene: dict[str | None, list[StageRow]] = defaultdict(list)
+    for row in planned:
+        of_scene[row.scene_id].append(row)
     scenes = [
         Scene(
             id=scene.id,
@@ -95,7 +123,7 @@ def _document(session: Session, job: JobRow) -> Job:
             scans=scene.scans,
             points=scene.points,
             state=scene.state,
-            stages=shown(row for row in planned if row.scene_id == scene.id),
+            stages=shown(of_scene[scene.id]),
         )
         for scene in jobs.scenes(session, job.id)
     ]

@@ -103,7 +103,7 @@ def _directory(services: Services) -> DirectoryStore:
     if isinstance(services.store, DirectoryStore):
         return services.store
     detail = "This service keeps its objects in an S3 server, whose own URLs lead to them."
-    raise ApiProblem(404, "not-found", "Not Found", detail)
+    raise ApiProblem(404, "not-found", "Not Found", f"{detail} Use those.")
 
 
 def _too_large(limit: int) -> ApiProblem:

@@ -21,6 +21,22 @@ class Readiness(BaseModel):
     checks: dict[str, str] = Field(description="What was asked and how it answered.")
 
 
+class Index(BaseModel):
+    """Where to go from here."""
+
+    service: str = "l3ps"
+    version: str
+    documentation: str = "/docs"
+    openapi: str = "/openapi.json"
+    health: list[str] = ["/healthz", "/readyz", "/metrics"]
+
+
+@router.get("/")
+async def index(request: Request) -> Index:
+    """What this is and where its documentation lies."""
+    return Index(version=request.app.version)
+
+
 @router.get("/healthz")
 async def healthz() -> Health:
     """Whether the process answers at all."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_api.trainings import service
 from l3ps_api.trainings.schemas import Training, TrainingPage, TrainingRequest
 from l3ps_platform.catalog import JobState
@@ -26,7 +26,7 @@ def train_model(request: TrainingRequest, response: Response, services: Services
 def list_trainings(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("trn")] = None,
     state: Annotated[JobState | None, Query(description="Only trainings in this state.")] = None,
 ) -> TrainingPage:
     """Trainings, newest first."""
@@ -43,3 +43,9 @@ def get_training(training_id: str, services: ServicesDep) -> Training:
 def cancel_training(training_id: str, services: ServicesDep) -> Training:
     """Ask a training to stop, which it does within seconds. One that is over stays as it is."""
     return service.cancel(services, training_id)
+
+
+@router.post("/trainings/{training_id}/retry", status_code=202)
+def retry_training(training_id: str, services: ServicesDep) -> Training:
+    """Run a failed or cancelled training again, from its last checkpoint. Refused in every other state."""
+    return service.retry(services, training_id)

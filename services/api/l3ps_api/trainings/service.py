@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from sqlalchemy.orm import Session
 
-from l3ps_api.jobs.service import stage_document
+from l3ps_api.jobs.service import check_active_jobs, stage_document
 from l3ps_api.problems import ApiProblem, conflict, invalid
 from l3ps_api.services import Services
 from l3ps_api.trainings.schemas import (
@@ -20,7 +20,7 @@ from l3ps_api.trainings.schemas import (
 from l3ps_platform.catalog import JobState, UploadState, annotation_sets, bundles, stages, trainings, uploads
 from l3ps_platform.errors import Conflict, NotFound, ObjectMissing
 from l3ps_platform.ids import is_id
-from l3ps_platform.workflow import cancel_training, submit_training
+from l3ps_platform.workflow import cancel_training, retry_training, submit_training
 
 _LOG_TAIL = 4000
 """Bytes of the log that a document carries: some forty lines."""
@@ -43,6 +43,7 @@ def create(services: Services, request: TrainingRequest) -> Training:
         settings["validation"] = measured
     try:
         with services.catalog.transaction() as tx:
+            check_active_jobs(services, tx.session)
             annotations_id = _annotations(tx.session, "annotations", request.annotations)
             validation_id = _annotations(tx.session, "validation", measured) if isinstance(measured, str) else None
             row = submit_training(
@@ -91,6 +92,13 @@ def cancel(services: Services, training_id: str) -> Training:
     """Ask a training to stop. NotFound."""
     with services.catalog.transaction() as tx:
         cancel_training(tx, training_id)
+    return get(services, training_id)
+
+
+def retry(services: Services, training_id: str) -> Training:
+    """Run a failed or cancelled training again. NotFound, Conflict for another."""
+    with services.catalog.transaction() as tx:
+        retry_training(tx, training_id)
     return get(services, training_id)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
+from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
@@ -35,6 +36,7 @@ from l3ps_platform.catalog import (
     annotation_sets,
     bundles,
     drives,
+    quotas,
     uploads,
 )
 from l3ps_platform.errors import Conflict, NotFound, UploadError
@@ -72,6 +74,9 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     multipart = services.store.create_multipart(key)
     try:
         with services.catalog.transaction() as tx:
+            if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
+                remedy = "Complete some of them, or give them up."
+                raise over_quota("uploads", settings.max_open_uploads, "open uploads", remedy)
             row = uploads.add(
                 tx,
                 id=upload_id,
@@ -90,6 +95,14 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
         raise
     urls = _presigned(services, row, range(1, count + 1))
     return OpenUpload(**_fields(row), part_size=row.part_size, parts=urls)
+
+
+def opened(services: Services, upload_id: str) -> OpenUpload:
+    """An upload as its opening answered, with fresh URLs. NotFound."""
+    with services.catalog.reading() as session:
+        row = uploads.get(session, upload_id)
+    urls = _presigned(services, row, range(1, row.parts + 1))
+    return OpenUpload(**_fields(row), part_size=part_size(row.size, services.settings), parts=urls)
 
 
 def page(services: Services, limit: int, cursor: str | None, state: UploadState | None) -> UploadPage:

@@ -4,7 +4,7 @@ import sqlalchemy as sa
 from alembic import op
 
 revision = "0006"
-down_revision = "0003"
+down_revision = "0005"
 
 DATE = sa.DateTime(timezone=True)
 STAGES = ("ingest", "segment", "refine", "publish", "train")

@@ -1,0 +1,1 @@
+"""The resources /v1/projects and /v1/me."""

@@ -1,0 +1,75 @@
+"""Responses held back until they are whole, and questions that the service asks itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+Headers = list[tuple[bytes, bytes]]
+
+_OF_THE_REQUEST = (b"content-length", b"content-type", b"idempotency-key", b"if-match", b"if-none-match", b"range")
+
+
+@dataclass(slots=True)
+class Reply:
+    """A whole response."""
+
+    status: int = 500
+    headers: Headers = field(default_factory=list)
+    body: bytes = b""
+
+    def header(self, name: bytes) -> str | None:
+        """The first header of this name, in lower case."""
+        return header(self.headers, name)
+
+    async def send(self, send: Send) -> None:
+        """Answer with it."""
+        headers = [(name, value) for name, value in self.headers if name != b"content-length"]
+        if self.status not in (204, 304):
+            headers.append((b"content-length", str(len(self.body)).encode()))
+        await send({"type": "http.response.start", "status": self.status, "headers": headers})
+        await send({"type": "http.response.body", "body": self.body})
+
+
+def header(headers: Headers, name: bytes) -> str | None:
+    """The first header of a name, in lower case."""
+    return next((value.decode("latin-1") for given, value in headers if given == name), None)
+
+
+async def hold(
+    app: ASGIApp, scope: Scope, receive: Receive, send: Send, wanted: Callable[[Message], bool] = lambda start: True
+) -> Reply | None:
+    """The response to a request; None where its start is not ``wanted``: then it has been passed on as it came."""
+    reply: Reply | None = None
+
+    async def collect(message: Message) -> None:
+        nonlocal reply
+        if message["type"] == "http.response.start" and wanted(message):
+            reply = Reply(message["status"], list(message.get("headers", ())))
+        elif reply is None:
+            await send(message)
+        elif message["type"] == "http.response.body":
+            reply.body += message.get("body", b"")
+
+    await app(scope, receive, collect)
+    return reply
+
+
+async def ask(app: ASGIApp, scope: Scope, path: str) -> Reply:
+    """The answer that the caller of a request would get to GET ``path``."""
+    headers = [(name, value) for name, value in scope["headers"] if name not in _OF_THE_REQUEST]
+    question: dict[str, Any] = {
+        **scope, "method": "GET", "path": path, "raw_path": path.encode(), "query_string": b"", "headers": headers,
+        "state": dict(scope["state"]),
+    }  # fmt: skip
+
+    async def nothing() -> Message:
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def nowhere(_: Message) -> None:
+        return None
+
+    return await hold(app, question, nothing, nowhere) or Reply()
