@@ -16,12 +16,13 @@ from l3ps_platform import workflow
 from l3ps_platform.catalog import AnnotationsRow, annotation_sets, trainings
 from l3ps_worker import backbones
 from l3ps_worker.context import Context
+from l3ps_worker.fetching import check_sha256, download, unpack_limits
 from l3ps_worker.ingest import check_model
 from l3ps_worker.keys import train_key
 from l3ps_worker.outputs import pin
 from l3ps_worker.trainer import children_cpu_seconds
 from l3ps_worker.training import OUT, TrainingRun
-from l3ps_worker.work import Done, check_sha256, download, sha256_of, unpack_limits
+from l3ps_worker.work import Done, sha256_of
 
 log = structlog.get_logger(__name__)
 

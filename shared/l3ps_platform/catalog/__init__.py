@@ -1,11 +1,10 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``outputs``, ``retention``,
-``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``, ``keys``, ``requests`` (POSTs
-that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``.
-What changes states is in
-:mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
+``outputs``, ``retention``, ``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``,
+``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through
+``outbox``), ``webhooks``. What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import (
@@ -22,6 +21,7 @@ from l3ps_platform.catalog import (
     quotas,
     requests,
     retention,
+    rules,
     stages,
     trainings,
     uploads,
@@ -47,6 +47,7 @@ from l3ps_platform.catalog.models import (
 )
 from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, RetentionRow
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
+from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
     DeliveryState,
@@ -65,6 +66,7 @@ __all__ = [
     "QUEUE_OF",
     "AnnotationsRow",
     "ApiKeyRow",
+    "ArrivalRow",
     "AttemptRow",
     "Base",
     "Catalog",
@@ -89,6 +91,7 @@ __all__ = [
     "QueueName",
     "RequestRow",
     "RetentionRow",
+    "RuleRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -114,6 +117,7 @@ __all__ = [
     "quotas",
     "requests",
     "retention",
+    "rules",
     "stages",
     "trainings",
     "uploads",

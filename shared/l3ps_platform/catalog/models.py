@@ -61,7 +61,9 @@ class DriveRow(Owned, Base):
     ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
     ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
     counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
-    archive file's: the client's claim until the ingest stage has compared it.
+    archive file's: the client's claim until the ingest stage has compared it. A drive by reference has a ``source``
+    (``s3://bucket/prefix``) and no object of ours; its ``sha256`` is over its files' names and contents where it is a
+    folder.
     """
 
     __tablename__ = "drives"
@@ -78,6 +80,7 @@ class DriveRow(Owned, Base):
     problem: Mapped[Json | None]
     info: Mapped[Json | None]
     object_key: Mapped[str | None]
+    source: Mapped[str | None]
     created_at: Mapped[datetime]
     deleted_at: Mapped[datetime | None]
 
@@ -138,9 +141,9 @@ class JobRow(Owned, Base):
         Index(None, "project_id", "state", "id"),
         Index(None, "drive_id", "id"),
         Index(None, "model_id", "id"),
+        Index(None, "deleted_at"),
         # Logs with truth are few; the metrics want the latest of their jobs.
         Index("ix_jobs_with_quality", "id", sqlite_where=_JUDGED, postgresql_where=_JUDGED),
-        Index(None, "deleted_at"),
     )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)

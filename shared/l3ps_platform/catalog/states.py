@@ -66,19 +66,19 @@ class StageState(StrEnum):
         return self in (StageState.DONE, StageState.FAILED, StageState.CANCELLED)
 
 
-class OutputState(StrEnum):
-    """A stage output's life; a doomed one is being deleted."""
-
-    LIVE = "live"
-    DOOMED = "doomed"
-
-
 class DeliveryState(StrEnum):
     """The life of a webhook's delivery; a failed one can be replayed."""
 
     PENDING = "pending"
     DELIVERED = "delivered"
     FAILED = "failed"
+
+
+class OutputState(StrEnum):
+    """A stage output's life; a doomed one is being deleted."""
+
+    LIVE = "live"
+    DOOMED = "doomed"
 
 
 class StageName(StrEnum):

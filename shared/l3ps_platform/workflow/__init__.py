@@ -3,6 +3,7 @@
 Functions take a transaction and change rows.
 
 accept_drive, accept_model     an upload is complete → ingest
+accept_source, settle_arrivals a log lies, or has arrived, in somebody else's bucket → ingest, job
 submit_job, cancel_job,        what clients ask for
   retry_job, and the same of trainings
 claim, prolong, report       a worker takes a stage and says it is alive
@@ -16,6 +17,7 @@ Cause, cause_of                why an attempt failed, in one word
 
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.workflow.again import outputs_to_keep, retry_job, retry_training
+from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.causes import Cause, cause_of, disk_is_full, failure
 from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, prolong, report
 from l3ps_platform.workflow.outcomes import (
@@ -31,7 +33,14 @@ from l3ps_platform.workflow.outcomes import (
     release_owned,
 )
 from l3ps_platform.workflow.pins import doom_output, note_output, pin_output
-from l3ps_platform.workflow.planning import accept_drive, accept_model, error_json, problems_of, submit_job
+from l3ps_platform.workflow.planning import (
+    accept_drive,
+    accept_model,
+    accept_source,
+    error_json,
+    problems_of,
+    submit_job,
+)
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
 from l3ps_platform.workflow.sweep import Sweeper
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
@@ -47,6 +56,7 @@ __all__ = [
     "Transaction",
     "accept_drive",
     "accept_model",
+    "accept_source",
     "cancel_job",
     "cancel_training",
     "cancelled",
@@ -73,6 +83,7 @@ __all__ = [
     "report",
     "retry_job",
     "retry_training",
+    "settle_arrivals",
     "submit_job",
     "submit_training",
     "training_done",

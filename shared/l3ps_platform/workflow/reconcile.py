@@ -21,6 +21,7 @@ from l3ps_platform.catalog.states import QueueName, StageState
 from l3ps_platform.errors import CatalogUnavailable, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
@@ -49,6 +50,7 @@ class Report:
     jobs: int = 0
     outputs: int = 0
     orphans: int = 0
+    arrivals: int = 0
 
 
 class Reconciler:
@@ -91,6 +93,7 @@ class Reconciler:
             expired=self._expire_leases(),
             retried=self._release_retries(),
             resent=self._resend(),
+            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds),
             **self._sweeper.run_once(),
         )
 

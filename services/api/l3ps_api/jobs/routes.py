@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from pydantic import AwareDatetime
 
+from l3ps_api.auth import PrincipalDep
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
 from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
@@ -16,9 +17,9 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 
 @router.post("", status_code=202)
-def create_job(request: JobRequest, response: Response, services: ServicesDep) -> Job:
+def create_job(request: JobRequest, response: Response, services: ServicesDep, principal: PrincipalDep) -> Job:
     """Start a job. On a drive that is still being checked it waits; on a rejected drive it is refused."""
-    job = service.create(services, request)
+    job = service.create(services, principal.project_id, request)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
