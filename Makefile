@@ -70,6 +70,9 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 load: servers ## 200 clients read their job's status for 3 minutes while two workers are busy; writes load-report.json
 	$(RUN) python tests/load/status.py
 
+bench-transfer: servers ## a large file up and down beside the bare minio client; MB=2048 ROUNDS=3; transfer-report.json
+	$(RUN) python tests/load/transfer.py $(if $(MB),--mb $(MB)) $(if $(ROUNDS),--rounds $(ROUNDS))
+
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
 

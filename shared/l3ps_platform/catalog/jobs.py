@@ -107,7 +107,7 @@ _REVISION = (
 
 
 def with_inputs(session: Session, id: str) -> tuple[JobRow, DriveRow, ModelRow]:
-    """One job that is not deleted with its drive and model, deleted or not. NotFound."""
+    """One job that is not deleted, with its drive and model, which may be. NotFound."""
     row = session.execute(_WITH_INPUTS, {"job": id}).one_or_none()
     if row is None:
         raise NotFound(JobRow.noun, id)
