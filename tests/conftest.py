@@ -95,15 +95,21 @@ def postgres_url(postgres_server: Any) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def minio_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """``KEY:SECRET@host:port`` of a real MinIO."""
+def minio_binary() -> Path:
+    """The MinIO server's program."""
     binary = setup_servers().minio_path()
     if not binary.is_file():
         missing(f"MINIO MISSING: no {binary}; run `python tests/setup_servers.py`, which builds it")
+    return Path(binary)
+
+
+@pytest.fixture(scope="session")
+def minio_server(minio_binary: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """``KEY:SECRET@host:port`` of a real MinIO."""
     port = free_port()
     folder = tmp_path_factory.mktemp("minio")
     environment = dict(os.environ, MINIO_ROOT_USER="tester", MINIO_ROOT_PASSWORD="tester-secret", MINIO_BROWSER="off")
-    command = [binary, "server", "--quiet", "--address", f"127.0.0.1:{port}", folder / "data"]
+    command = [minio_binary, "server", "--quiet", "--address", f"127.0.0.1:{port}", folder / "data"]
     with running(command, folder / "log", lambda: healthy(port), env=environment):
         yield f"tester:tester-secret@127.0.0.1:{port}"
     shutil.rmtree(folder, ignore_errors=True)

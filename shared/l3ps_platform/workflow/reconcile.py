@@ -95,7 +95,7 @@ class Reconciler:
             retried=self._release_retries(),
             resent=self._resend(),
             spent=self._drop_spent(),
-            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds),
+            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs),
             **self._sweeper.run_once(),
         )
 

@@ -154,24 +154,25 @@ def service(request, tmp_path_factory) -> Iterator[Service]:
 
 
 @contextmanager
-def _embedded(request, data) -> Iterator[Settings]:
+def _embedded(request, data, training: bool = True) -> Iterator[Settings]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in TUNING.items():
             patch.setenv(name, value)
-        with Stack(StackOptions(data, port=0, training=True)) as stack:
+        with Stack(StackOptions(data, port=0, training=training)) as stack:
             yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]), token=stack.token)
 
 
 @contextmanager
-def _servers(request, data) -> Iterator[Settings]:
+def _servers(request, data, redis_database: int = 1) -> Iterator[Settings]:
     postgres, minio, redis = map(request.getfixturevalue, ("postgres_server", "minio_server", "redis_server"))
     with psycopg.connect(postgres.get_uri(), autocommit=True) as connection:
-        connection.execute("CREATE DATABASE service")  # its reconciler would tidy up in other tests' catalogs
+        database = f"service_{redis_database}"  # its reconciler would tidy up in other tests' catalogs
+        connection.execute(f"CREATE DATABASE {database}")
     settings = Settings(
         data_dir=data,
-        database_url=postgres.get_uri(database="service"),
+        database_url=postgres.get_uri(database=database),
         objects_url=f"s3://{minio}/l3ps-{secrets.token_hex(4)}?secure=0",
-        redis_url=redis.removesuffix("/0") + "/1",  # its worker takes every message, other tests' too
+        redis_url=f"{redis.removesuffix('/0')}/{redis_database}",  # its worker takes every message, other tests' too
         port=free_port(),
         token=secrets.token_urlsafe(32),
     )
