@@ -12,6 +12,8 @@ from l3ps_api.limits import over_quota
 from l3ps_api.problems import ApiProblem, items
 from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
+from l3ps_platform.catalog.requests import note_result
+from l3ps_platform.errors import Conflict
 from l3ps_platform.workflow import cancel_job, submit_job
 
 _STEPS = (
@@ -72,9 +74,12 @@ def get(services: Services, job_id: str) -> Job:
 
 
 def cancel(services: Services, job_id: str) -> Job:
-    """Ask a job to stop. NotFound, Conflict when it is over."""
+    """Ask a job to stop; one that is cancelled stays so. NotFound, Conflict when it came to another end."""
     with services.catalog.transaction() as tx:
-        cancel_job(tx, job_id)
+        state = cancel_job(tx, job_id).state
+        if state in (JobState.SUCCEEDED, JobState.FAILED):
+            raise Conflict(f"job {job_id} has {state} already: there is nothing left to cancel")
+        note_result(tx.session, "jobs", job_id)
     return get(services, job_id)
 
 
