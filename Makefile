@@ -5,7 +5,7 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test fuzz-api bench bench-train lint format setup setup-dev setup-trainer servers compose-check demo-model clean
+.PHONY: help demo test hostile fuzz-api bench bench-train lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -19,10 +19,13 @@ test: lint servers ## style, types, import rules and every test
 fuzz-api: servers ## send the API what its OpenAPI document allows and forbids; EXAMPLES=200 an operation take minutes
 	L3PS_FUZZ_EXAMPLES=$(or $(EXAMPLES),200) $(RUN) pytest -s --timeout 900 tests/contract/api/test_openapi_document.py
 
+hostile: servers ## every hostile upload on both stacks, a million empty files among them: 20 minutes, 2 GB of disk
+	L3PS_HOSTILE=1 $(RUN) pytest tests/hostile --timeout 3600
+
 lint: setup-dev
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
-	$(RUN) mypy shared/l3ps shared/l3ps_cluster shared/l3ps_platform services/*/l3ps_*
+	$(RUN) mypy shared/l3ps shared/l3ps_client shared/l3ps_cluster shared/l3ps_platform services/*/l3ps_*
 	$(RUN) lint-imports
 
 format: setup-dev ## put the code into the house style
@@ -59,6 +62,9 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
+
+compose-chaos: setup ## the same, and kill -9 of every container in turn, each during a job; needs root
+	$(RUN) python deploy/compose_check.py --kill
 
 demo-model: setup-dev ## train the demo's model again, from thirty simulated images
 	rm -rf demo-model

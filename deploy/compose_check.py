@@ -1,6 +1,7 @@
 """Prove docker-compose.yml with a real engine: build, start, push a drive through, look at what came back, tear down.
 
-    .venv/bin/python deploy/compose_check.py [--offline] [--keep] [--drive LOG] [--model BUNDLE] [--engine-data DIR]
+    .venv/bin/python deploy/compose_check.py [--offline] [--keep] [--kill] [--drive LOG] [--model BUNDLE]
+                                             [--engine-data DIR]
 
 Starts an engine of its own where none runs, and leaves nothing behind: no container, volume, network, process or
 file, but for the build cache of an engine that was there before. One line a step; exit status 0 (PASS) or 1 (FAIL).
@@ -18,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from composecheck import looks
+from composecheck import kills, looks
 from composecheck.command import ROOT, CheckError
 from composecheck.engine import engine
 from composecheck.images import provide
@@ -106,6 +107,13 @@ def exercise(report: Report, stack: Stack, options: argparse.Namespace, work: Pa
         facts.append(looks.labels(stack, job, drive))
     with report.step("metrics") as facts:
         facts.append(looks.metrics(stack))
+    if options.kill:
+        for number, victim in enumerate(kills.VICTIMS, start=1):
+            fresh = work / f"drive-{victim}"
+            words = ("simulate", "--scenes", "2", "--scans", "3", "--seed", str(SEED + number), "--out")
+            stack.cli(*words, fresh, seconds=300)
+            with report.step(f"kill -9 of {victim} in the middle of a job") as facts:
+                facts.append(kills.kill(stack, victim, fresh, options.model))
     with report.step("down, up again, labels still there") as facts:
         stack.down()
         stack.up()
@@ -143,6 +151,7 @@ def main() -> int:
     parser.add_argument("--keep", action="store_true", help="leave the stack up until Ctrl-C")
     parser.add_argument("--drive", type=Path, help="a nuScenes drive to push through instead of a simulated one")
     parser.add_argument("--model", default=str(MODEL), help="the model bundle to label it with")
+    parser.add_argument("--kill", action="store_true", help="kill -9 every container in turn, each during a job (root)")
     parser.add_argument("--engine-data", type=Path, help="where an engine of our own keeps its images for next time")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, interrupt)

@@ -80,3 +80,16 @@ class Conflict(PlatformError):  # noqa: N818
 
 class LeaseLost(PlatformError):  # noqa: N818
     """Another worker owns the stage now, or nobody: drop everything and return."""
+
+
+class TargetRefused(PlatformError):  # noqa: N818
+    """A webhook may not be sent to this URL.
+
+    Attributes:
+        what: what is wrong with it.
+        remedy: what to do.
+    """
+
+    def __init__(self, what: str, remedy: str) -> None:
+        self.what, self.remedy = what, remedy
+        super().__init__(what)

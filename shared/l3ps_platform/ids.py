@@ -11,6 +11,7 @@ import re
 import secrets
 import threading
 import time
+from datetime import datetime
 from typing import Literal, get_args
 
 Prefix = Literal["ann", "arr", "drv", "job", "key", "mdl", "msg", "prj", "rul", "scn", "stg", "trn", "upl", "whk"]
@@ -31,13 +32,23 @@ def new_id(prefix: Prefix) -> str:
         same_moment = fresh >> _RANDOM_BITS <= _last >> _RANDOM_BITS
         # Within a millisecond, or after the clock was set back: on from the last id, by an unguessable step.
         _last = value = _last + 1 + secrets.randbits(32) if same_moment else fresh
-    digits = []
-    for _ in range(_LENGTH):
-        value, digit = divmod(value, 32)
-        digits.append(_ALPHABET[digit])
-    return f"{prefix}_{''.join(reversed(digits))}"
+    return _written(prefix, value)
+
+
+def lowest_id(prefix: Prefix, moment: datetime) -> str:
+    """What sorts before every id made at or after a moment, and after every one made before it."""
+    milliseconds = min(max(int(moment.timestamp() * 1000), 0), (1 << 48) - 1)
+    return _written(prefix, milliseconds << _RANDOM_BITS)
 
 
 def is_id(text: str, prefix: Prefix) -> bool:
     """Whether ``text`` has the form of an id with this prefix (not whether such a row exists)."""
     return bool(_PATTERN.fullmatch(text)) and text.startswith(prefix)
+
+
+def _written(prefix: Prefix, value: int) -> str:
+    digits = []
+    for _ in range(_LENGTH):
+        value, digit = divmod(value, 32)
+        digits.append(_ALPHABET[digit])
+    return f"{prefix}_{''.join(reversed(digits))}"

@@ -25,17 +25,13 @@ from l3ps_platform.settings import Settings
 TASK_NAMES = {name: f"l3ps.{name.value}" for name in StageName}
 """Which Celery task does which stage."""
 
-# Redelivery is no part of our recovery (leases are), so messages of long stages must not come back while they run:
-# a task of 14 s under a visibility timeout of 5 s was started three times.
-_VISIBILITY_SECONDS = 24 * 3600
-
 
 def make_app(settings: Settings) -> Celery:
     """The Celery application of workers and clients alike."""
     app = Celery("l3ps", broker=settings.broker_url)
     transport = {
         # The shortest of the three places wins, so all three get the same.
-        "visibility_timeout": _VISIBILITY_SECONDS,
+        "visibility_timeout": settings.visibility_seconds,
         # At kombu's defaults the unacknowledged messages of a killed worker were looked at after 100 s.
         "unacked_restore_interval": 1,
         "unacked_restore_throttle": 1,
@@ -46,8 +42,8 @@ def make_app(settings: Settings) -> Celery:
     app.conf.update(
         broker_transport_options=transport,
         result_backend=None,
-        result_backend_transport_options={"visibility_timeout": _VISIBILITY_SECONDS},
-        visibility_timeout=_VISIBILITY_SECONDS,
+        result_backend_transport_options={"visibility_timeout": settings.visibility_seconds},
+        visibility_timeout=settings.visibility_seconds,
         broker_connection_retry_on_startup=True,
         broker_connection_max_retries=None,  # a worker waits for Redis however long it takes
         task_queues=[KombuQueue(name.value, Exchange(name.value), routing_key=name.value) for name in QueueName],  # type: ignore[no-untyped-call]
@@ -68,6 +64,8 @@ def make_app(settings: Settings) -> Celery:
         # and the prefetch counter drifts with acks_late.
         worker_prefetch_multiplier=1,
         worker_disable_prefetch=True,
+        # For so long a result of a child that died is waited for, while its slot takes nothing; ours are rows.
+        worker_lost_wait=1.0,
         worker_cancel_long_running_tasks_on_connection_loss=False,  # the lease, not the connection, is ownership
         task_time_limit=settings.stage_seconds,
         worker_hijack_root_logger=False,

@@ -6,12 +6,13 @@ The same code serves the embedded stack, one machine and a cluster; only the URL
 from __future__ import annotations
 
 from functools import lru_cache
+from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 MiB = 1024 * 1024
 GiB = 1024 * MiB
@@ -115,17 +116,29 @@ class Settings(BaseSettings):
     heartbeat_seconds: float = 10.0
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
+    # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
+    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    outage_retry_seconds: float = 60.0
+    outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0
     # A queued stage without a claim for this long whose message is not in the queue is sent again.
     resend_seconds: float = 30.0
+    # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
+    cancel_seconds: float = 10.0
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis
     # would deliver the message a second time.
     train_seconds: float = Field(default=20 * 3600.0, gt=0, lt=24 * 3600)
     progress_seconds: float = 0.5
+    # When Redis delivers a message again that nobody has acknowledged. Redelivery is no part of our recovery (leases
+    # are), so messages of long stages must not come back while they run: a task of 14 s under a visibility timeout of
+    # 5 s was started three times. Claims make that harmless, but each costs a look at the catalog.
+    visibility_seconds: int = Field(default=24 * 3600, gt=0)
 
     threads: int = 2  # of numeric libraries, per worker process
+    # Workers yield the processor to an API on the same machine, whose answers take milliseconds.
+    nice: int = Field(default=10, ge=0, le=19)
     concurrency: int = 1  # processes per worker: a stage uses `threads` threads and up to several GB
 
     # Memory that the refinement of one scene may take, per worker process; a larger scene is refined in overlapping
@@ -139,9 +152,28 @@ class Settings(BaseSettings):
     backbones_dir: Path | None = None  # None: data_dir/backbones
     checkpoint_seconds: float = 30.0  # how often a training's checkpoint and log go to the object store
 
+    event_days: float = Field(default=30.0, gt=0)  # the event log and finished deliveries are kept for so long
+    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; one costs about 50 kB
+    # Networks that webhooks may reach though they are not public, e.g. 10.1.0.0/16,127.0.0.1/32; else a client could
+    # have the service call into its own network.
+    webhook_allow: Annotated[tuple[IPv4Network | IPv6Network, ...], NoDecode] = ()
+    webhook_http: bool = False  # whether webhooks may go without TLS
+    # The wait before each attempt; these are the specification's (standardwebhooks.com), over three days in all.
+    webhook_retry_seconds: Annotated[tuple[float, ...], NoDecode] = (
+        *(0.0, 5.0, 300.0, 1800.0),
+        *(hours * 3600.0 for hours in (2, 5, 10, 14, 20, 24)),
+    )
+    webhook_timeout_seconds: float = Field(default=15.0, gt=0)  # for an attempt as a whole; the specification: 15 to 30
+    webhook_disable_days: float = Field(default=5.0, gt=0)  # a webhook that took nothing for so long is switched off
+
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     log_format: Literal["json", "console"] = "json"
+
+    @field_validator("webhook_allow", "webhook_retry_seconds", mode="before")
+    @classmethod
+    def _listed(cls, value: object) -> object:
+        return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
     @field_validator("database_url")
     @classmethod

@@ -18,6 +18,8 @@ from l3ps_api.auth import Gate, authenticate
 from l3ps_api.description import describe
 from l3ps_api.drives.routes import router as drives
 from l3ps_api.etags import ETags
+from l3ps_api.events.hub import EventHub
+from l3ps_api.events.routes import router as events
 from l3ps_api.idempotency import Idempotency
 from l3ps_api.jobs.routes import router as jobs
 from l3ps_api.keyring import Keyring
@@ -34,6 +36,8 @@ from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_api.webhooks import service as webhook_service
+from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
@@ -41,6 +45,7 @@ from l3ps_platform.metrics import CatalogCollector
 from l3ps_platform.objects import open_store
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
+from l3ps_platform.webhooks import Deliverer
 from l3ps_platform.workflow import Reconciler
 
 log = structlog.get_logger(__name__)
@@ -54,6 +59,9 @@ Drive logs in, panoptic labels on every LiDAR point out.
 
 A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
 `GET /v1/trainings/{id}` shows progress, log and report.
+
+`GET /v1/jobs/{id}/events` follows a job as server-sent events, `GET /v1/events` all that happens; `POST /v1/webhooks`
+has a URL told.
 
 Every error is a problem document (RFC 9457) that names the field at fault and the remedy.
 """
@@ -69,18 +77,23 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.services = services
     app.state.keyring = Keyring(settings, catalog)
+    app.state.events = EventHub(catalog)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings, keys, projects):
+    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(
         Idempotency, services=services, operations=lambda: operations_of(app),
-        remade={"uploads": upload_service.opened, "api_keys": key_service.shown_again},
+        remade={
+            "uploads": upload_service.opened,
+            "api_keys": key_service.shown_again,
+            "webhooks": webhook_service.shown_again,
+        },
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
@@ -106,12 +119,19 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         log.warning("object store not reached at the start, /readyz tries again", reason=str(error))
     stop = threading.Event()
     reconciler = Reconciler(services.catalog, services.queue, services.store, services.settings)
-    broom = threading.Thread(target=reconciler.run, args=(stop,), name="reconciler", daemon=True)
-    broom.start()
+    deliverer = Deliverer(services.catalog, services.settings)
+    chores = [
+        threading.Thread(target=run, args=(stop,), name=name, daemon=True)
+        for name, run in (("reconciler", reconciler.run), ("deliverer", deliverer.run))
+    ]
+    for chore in chores:
+        chore.start()
     try:
         yield
     finally:
         stop.set()
-        await run_in_threadpool(broom.join, 10)
+        app.state.events.close()
+        for chore in chores:
+            await run_in_threadpool(chore.join, 10)
         services.catalog.dispose()
         services.queue.close()

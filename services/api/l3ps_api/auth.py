@@ -32,7 +32,7 @@ _REMEDY = "Send `Authorization: Bearer SECRET`, an API key's or the operator's (
 _bearer = HTTPBearer(auto_error=False, description="An API key's secret, or the operator's token (L3PS_TOKEN).")
 
 
-def authenticate(
+async def authenticate(
     request: Request, _: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)] = None
 ) -> Principal:
     """The caller, whom the gate has let in."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from fastapi import Depends, Query, Request
@@ -10,6 +10,7 @@ from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
 from l3ps_api.auth import PrincipalDep
+from l3ps_api.jobs.documents import Documents
 from l3ps_platform.catalog import DEFAULT_PROJECT
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.ids import Prefix, is_id
@@ -26,18 +27,20 @@ class Services:
     catalog: Catalog
     store: ObjectStore
     queue: Queue
+    documents: Documents = field(default_factory=Documents)
 
 
-def _system(request: Request) -> Services:
+async def _system(request: Request) -> Services:
     found: Services = request.app.state.services
     return found
 
 
+# Async though they wait for nothing: of others FastAPI makes a visit to the thread pool each.
 SystemDep = Annotated[Services, Depends(_system)]
 """For what belongs to no project: health, metrics, presigned objects."""
 
 
-def _own(system: SystemDep, principal: PrincipalDep) -> Services:
+async def _own(system: SystemDep, principal: PrincipalDep) -> Services:
     return replace(system, catalog=system.catalog.scoped(principal.project_id))
 
 

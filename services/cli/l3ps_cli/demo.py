@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from l3ps_cli.client import Client
 from l3ps_cli.console import JOB_FAILED, err, fail, out, service_errors
-from l3ps_cli.download import DamagedDownloadError, fetch_labels
+from l3ps_cli.download import fetch_labels
 from l3ps_cli.draw import draw
 from l3ps_cli.processes import ChildDiedError
 from l3ps_cli.progress import bars
 from l3ps_cli.report import quality_table, stage_table
 from l3ps_cli.stack import Stack, StackError, StackOptions
-from l3ps_cli.submit import check_log, create_job, ensure_model, require_success, upload_log
+from l3ps_cli.submit import check_log, ensure_model, require_success, upload_log
 from l3ps_cli.up import StopRequested, stop_on_signals
 from l3ps_cli.watch import wait_for_job
+from l3ps_client import Client, Job
 
 DEMO_MODEL = Path(__file__).parent / "models" / "demo"
 SCENES, SCANS, SEED = 2, 10, 7
@@ -56,7 +56,7 @@ def demo(
         fail("The demo was stopped; the service it had started is gone.", JOB_FAILED)
     except ChildDiedError as error:
         fail(f"{error}. Its last lines:\n{error.last_lines}", JOB_FAILED)
-    except (StackError, TimeoutError, DamagedDownloadError) as error:
+    except (StackError, TimeoutError) as error:
         fail(str(error), JOB_FAILED)
     out.print(stage_table(job))
     if job["quality"]:
@@ -69,10 +69,10 @@ def demo(
     out.print(f"{time.monotonic() - start:.0f} seconds in all", highlight=False)
 
 
-def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str, segment: str) -> dict[str, Any]:
+def _run(client: Client, stack: Stack, log: Path, model: Path, preset: str, segment: str) -> Job:
     name = ensure_model(client, str(model))
     document = upload_log(client, log)
-    job = create_job(client, document["id"], model=name, preset=preset, segment=segment)
+    job = client.jobs.create(drive_id=document["id"], model=name, preset=preset, segment=segment)
     job = wait_for_job(client, job["id"], err, stack.check)
     require_success(job)
     return job

@@ -14,7 +14,8 @@ from typer.core import TyperGroup
 
 COMMANDS = (
     "label", "evaluate", "draw", "simulate", "simulate-images", "bench", "ablate", "train", "model", "up", "submit",
-    "jobs", "download", "submit-training", "trainings", "demo",
+    "jobs", "download", "drives", "models", "uploads", "submit-training", "trainings", "keys", "webhooks", "whoami",
+    "demo",
 )  # fmt: skip
 """In the order of ``l3ps --help``. Module ``l3ps_cli.NAME`` has a function of that name, or ``app`` with commands; a
 hyphen of the name is an underscore there. ``CONTEXT`` holds the settings that the function wants of its own."""

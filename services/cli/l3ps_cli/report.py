@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.table import Table
@@ -44,7 +45,7 @@ def _remarks(primal: dict[str, Any], refined: dict[str, Any]) -> str:
     return "\n".join(remarks)
 
 
-def stage_table(job: dict[str, Any]) -> Table:
+def stage_table(job: Mapping[str, Any]) -> Table:
     """What each stage of a job took, its steps indented below it."""
     table = Table("stage", "state", title="Stages", title_justify="left")
     for name in ("seconds", "CPU s", "peak MB"):

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
-from urllib.parse import quote
+from typing import Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
 from l3ps.errors import DriveLogError, InputError, Problem
 from l3ps.presets import PRESETS
 from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS
-from l3ps_cli.client import Client, ServiceProblemError, sentences
-from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
+from l3ps_cli.console import BAD_INPUT, JOB_FAILED, bytes_bar, err, fail, out, service_errors
 from l3ps_cli.errors import INTERRUPTED
-from l3ps_cli.packing import ARCHIVE_SUFFIXES, Report, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
+from l3ps_cli.packing import ARCHIVE_SUFFIXES, bundle_name, is_archive_name, pack_bundle, pack_log, sha256_of
 from l3ps_cli.watch import wait_for_job
+from l3ps_client import Annotations, Client, Drive, Job, sentences
+
+Kind = Literal["drive", "annotations"]
 
 
 def submit(
@@ -49,9 +48,8 @@ def submit(
         _check_settings(preset, segment, formats, protocol)
         model_name = ensure_model(client, model)
         drive = upload_log(client, log)
-        job = create_job(
-            client,
-            drive["id"],
+        job = client.jobs.create(
+            drive_id=drive["id"],
             model=model_name,
             preset=preset,
             segment=segment,
@@ -89,39 +87,16 @@ def _check_settings(preset: str, segment: str, formats: list[str] | None, protoc
             raise InputError(Problem("unknown-setting", option, what, remedy))
 
 
-def create_job(
-    client: Client,
-    drive_id: str,
-    *,
-    model: str,
-    preset: str,
-    segment: str = DEFAULT_SEGMENT,
-    formats: list[str] | None = None,
-    protocol: str | None = None,
-    skip_bad_scans: bool = False,
-) -> dict[str, Any]:
-    """Start a job; what is None is left to the service."""
-    request: dict[str, Any] = {
-        "drive_id": drive_id,
-        "model": model,
-        "preset": preset,
-        "segment": segment,
-        "skip_bad_scans": skip_bad_scans,
-    }
-    if formats:
-        request["formats"] = formats
-    if protocol:
-        request["protocol"] = protocol
-    return client.post("/jobs", request)
-
-
-def require_success(job: dict[str, Any]) -> None:
+def require_success(job: Job) -> None:
     """End the command with the reason and the exit code for it where a finished job did not succeed."""
     if job["state"] == "cancelled":
         fail(f"Job {job['id']} was cancelled.", JOB_FAILED)
     if job["state"] == "failed":
-        why = {"detail": f"Job {job['id']} failed. {job.get('message') or ''}", "errors": job.get("errors")}
-        rejected = "rejected" in (job["drive"]["state"], job["model"]["state"])
+        why: dict[str, Any] = {
+            "detail": f"Job {job['id']} failed. {job.get('message') or ''}",
+            "errors": job.get("errors"),
+        }
+        rejected = "rejected" in (job["drive"].get("state"), job["model"].get("state"))
         fail("\n".join(sentences(why)), BAD_INPUT if rejected else JOB_FAILED)
 
 
@@ -129,25 +104,24 @@ def ensure_model(client: Client, model: str) -> str:
     """The name of a model that the service has; a bundle given by path is uploaded unless it is there already."""
     path = Path(model)
     if not (path.is_dir() or path.is_file()):
-        client.get(f"/models/{quote(model, safe='')}")  # an unknown name is said before a log is sent
+        client.models.get(model)  # an unknown name is said before a log is sent
         return model
-    name = bundle_name(path)
+    return upload_bundle(client, path, bundle_name(path))
+
+
+def upload_bundle(client: Client, path: Path, name: str) -> str:
+    """Upload a model bundle, directory or zip, under a name, unless the service has it already; returns the name."""
     with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
         archive = path
         if path.is_dir():
             archive = Path(scratch) / f"{name}.zip"
             pack_bundle(path, archive)
         sha256 = sha256_of(archive)
-        try:
-            known = client.get(f"/models/{name}")
-        except ServiceProblemError as error:
-            if error.status != 404:
-                raise
-        else:
-            if known["sha256"] == sha256 and known["state"] != "rejected":
-                return name
-        with _bytes_bar("uploading the model", archive.stat().st_size) as (advance, _):
-            client.upload(archive, "model", sha256, name, advance)
+        known = client.models.find(name)
+        if known is not None and known["sha256"] == sha256 and known["state"] != "rejected":
+            return name
+        with bytes_bar("uploading the model", archive.stat().st_size) as report:
+            client.models.upload(archive, name=name, sha256=sha256, progress=report)
     return name
 
 
@@ -163,7 +137,7 @@ def check_log(log: Path, what_it_is: str = "a drive log") -> None:
         raise DriveLogError(Problem("no-archive", str(log), what, remedy))
 
 
-def upload_log(client: Client, log: Path, kind: str = "drive") -> dict[str, Any]:
+def upload_log(client: Client, log: Path, kind: Kind = "drive") -> Drive | Annotations:
     """Upload a log or annotations that ``check_log`` passed, unless the service has some of the same bytes.
 
     Args:
@@ -177,7 +151,7 @@ def upload_log(client: Client, log: Path, kind: str = "drive") -> dict[str, Any]
     if log.is_dir():
         with tempfile.TemporaryDirectory(prefix="l3ps-") as scratch:
             archive = Path(scratch) / f"{log.resolve().name}.tar"
-            with _bytes_bar("packing") as (_, report):
+            with bytes_bar("packing") as report:
                 pack_log(log, archive, report)
             return _upload_archive(client, archive, log.resolve().name, kind)
     name = log.name
@@ -186,26 +160,14 @@ def upload_log(client: Client, log: Path, kind: str = "drive") -> dict[str, Any]
     return _upload_archive(client, log, name, kind)
 
 
-def _upload_archive(client: Client, archive: Path, name: str, kind: str) -> dict[str, Any]:
-    size = archive.stat().st_size
-    with _bytes_bar("checksum") as (_, report):
+def _upload_archive(client: Client, archive: Path, name: str, kind: Kind) -> Drive | Annotations:
+    with bytes_bar("checksum") as report:
         sha256 = sha256_of(archive, report)
-    folder, called = {"drive": ("/drives", "this log"), "annotations": ("/annotations", "these annotations")}[kind]
-    for known in client.get(folder, sha256=sha256)["items"]:
-        if known.get("state") != "rejected":
-            err.print(f"the service has {called} already: {known['id']}", highlight=False)
-            return dict(known)
-    with _bytes_bar("uploading", size) as (advance, _):
-        return client.upload(archive, kind, sha256, name, advance)
-
-
-@contextmanager
-def _bytes_bar(what: str, total: int | None = None) -> Iterator[tuple[Callable[[int], None], Report]]:
-    """A bar of bytes and the two ways to move it: by what is new, or by (done, total)."""
-    columns = (TextColumn("{task.description:<20}"), BarColumn(24), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, console=err) as progress:
-        bar = progress.add_task(what, total=total)
-        yield (
-            lambda count: progress.advance(bar, count),
-            lambda done, whole: progress.update(bar, completed=done, total=whole),
-        )
+    files = client.drives if kind == "drive" else client.annotations
+    known = files.find(sha256)
+    if known is not None:
+        called = {"drive": "this log", "annotations": "these annotations"}[kind]
+        err.print(f"the service has {called} already: {known['id']}", highlight=False)
+        return known
+    with bytes_bar("uploading", archive.stat().st_size) as report:
+        return files.upload(archive, name=name, sha256=sha256, progress=report)

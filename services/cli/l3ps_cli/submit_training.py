@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from l3ps.errors import InputError, Problem
-from l3ps_cli.client import Client, sentences
 from l3ps_cli.console import BAD_INPUT, JOB_FAILED, err, fail, out, service_errors
 from l3ps_cli.errors import INTERRUPTED
 from l3ps_cli.submit import check_log, upload_log
 from l3ps_cli.watch import wait_for_training
+from l3ps_client import Client, Training, sentences
 
 
 def submit_training(
@@ -45,21 +45,22 @@ def submit_training(
         measured = _share(validation)
         if isinstance(measured, Path):
             check_log(measured, "annotated images or a share")
-        request: dict[str, Any] = {"name": name, "backbone": backbone, "format": format, "seed": seed, "int8": int8}
-        given = {
+        settings: dict[str, Any] = {
+            "format": format,
+            "seed": seed,
+            "int8": int8,
             "recipe": recipe,
             "classes": _classes(classes) if classes else None,
             "images": images,
             "size": _size("--size", size),
             "balanced": _size("--balanced", balanced),
             "epochs": epochs,
-            "validation": measured if isinstance(measured, float) else None,
         }
-        request |= {field: value for field, value in given.items() if value is not None}
-        request["annotations"] = upload_log(client, annotations, "annotations")["id"]
-        if isinstance(measured, Path):
-            request["validation"] = upload_log(client, measured, "annotations")["id"]
-        training = client.post("/models/train", request)
+        sent = upload_log(client, annotations, "annotations")["id"]
+        checked = upload_log(client, measured, "annotations")["id"] if isinstance(measured, Path) else measured
+        training = client.trainings.create(
+            name=name, annotations=sent, backbone=backbone, validation=checked, **settings
+        )
         if wait:
             try:
                 training = wait_for_training(client, training["id"], err)
@@ -71,14 +72,14 @@ def submit_training(
     if as_json:
         out.print_json(data=training)
     elif training["state"] == "succeeded":
-        out.print(f"model {training['model']['name']}: ready", highlight=False)
+        out.print(f"model {training['name']}: ready", highlight=False)
     else:
         out.print(f"training {training['id']}: {training['state']}", highlight=False)
     if wait:
         _require_success(training)
 
 
-def _require_success(training: dict[str, Any]) -> None:
+def _require_success(training: Training) -> None:
     if training["state"] == "cancelled":
         fail(f"Training {training['id']} was cancelled.", JOB_FAILED)
     if training["state"] == "failed":

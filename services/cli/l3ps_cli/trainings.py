@@ -3,56 +3,40 @@
 from __future__ import annotations
 
 from typing import Annotated, Any
-from urllib.parse import quote
 
 import typer
-from rich.table import Table
 
-from l3ps_cli.client import Client
-from l3ps_cli.console import out, service_errors
-from l3ps_cli.jobs import COLORS
+from l3ps_cli.console import AsJson, Limit, out, print_items, service_errors, state
+from l3ps_cli.jobs import one_of
+from l3ps_client import Client, Training
 
 
 def trainings(
     training: Annotated[str | None, typer.Argument(help="Show this training in full.", show_default=False)] = None,
-    limit: Annotated[int, typer.Option(min=1, max=200, help="How many, newest first.")] = 20,
-    state: Annotated[str | None, typer.Option(help="Only trainings in this state.", show_default=False)] = None,
+    limit: Limit = 20,
+    only: Annotated[
+        str | None, typer.Option("--state", help="Only trainings in this state.", show_default=False)
+    ] = None,
     cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the training.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the service's document.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Go on with it from its last checkpoint.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """List the service's trainings, newest first; with an id, show that training and its log, or cancel it."""
-    if cancel and not training:
-        raise typer.BadParameter("--cancel needs the id of a training")
+    """List the service's trainings, newest first; with an id, show that training and its log, cancel or retry it."""
+    act = one_of("training", training, cancel=cancel, retry=retry)
     with service_errors(), Client() as client:
-        path = f"/trainings/{quote(training, safe='')}" if training else "/trainings"
-        if cancel:
-            document = client.post(f"{path}/cancel")
+        if training is None:
+            page = client.trainings.page(limit=limit, state=only)
+            nothing = "No trainings yet: `l3ps submit-training ANNOTATIONS --name NAME --backbone NAME` makes one."
+            print_items(page, COLUMNS, as_json=as_json, nothing=nothing)
         else:
-            document = client.get(path) if training else client.get(path, limit=limit, state=state)
+            acts = {"cancel": client.trainings.cancel, "retry": client.trainings.retry}
+            _print(acts.get(act, client.trainings.get)(training), as_json)
+
+
+def _print(training: Training, as_json: bool) -> None:
     if as_json:
-        out.print_json(data=document)
-    elif training:
-        _show(document)
-    else:
-        _list(document["items"])
-
-
-def _list(documents: list[dict[str, Any]]) -> None:
-    if not documents:
-        out.print("No trainings yet: `l3ps submit-training ANNOTATIONS --name NAME --backbone NAME` makes one.")
+        out.print_json(data=training)
         return
-    table = Table(box=None)
-    table.add_column("training", min_width=29, no_wrap=True)  # an id is for copying, so it is never cut short
-    for name in ("model", "backbone", "state", "done", "figures"):
-        table.add_column(name)
-    for one in documents:
-        state = f"[{COLORS.get(one['state'], 'white')}]{one['state']}[/]"
-        row = (one["name"], one["settings"]["backbone"], state)
-        table.add_row(one["id"], *row, f"{100 * one['progress']:.0f} %", _figures(one))
-    out.print(table)
-
-
-def _show(training: dict[str, Any]) -> None:
     out.print(f"{training['id']}: {training['state']}, {100 * training['progress']:.0f} % done", highlight=False)
     what = f"{training['name']} from {training['annotations']['name']} over {training['settings']['backbone']}"
     out.print(what, markup=False, highlight=False)
@@ -66,6 +50,16 @@ def _show(training: dict[str, Any]) -> None:
         out.print(training["log"], style="dim", markup=False, highlight=False, soft_wrap=True, end="")
 
 
-def _figures(training: dict[str, Any]) -> str:
+def _figures(training: Any) -> str:
     numbers = {name: value for name, value in training["figures"].items() if isinstance(value, int | float)}
     return ", ".join(f"{name} {value:.3g}" for name, value in numbers.items())
+
+
+COLUMNS = {
+    "training": lambda training: training["id"],
+    "model": lambda training: training["name"],
+    "backbone": lambda training: training["settings"]["backbone"],
+    "state": lambda training: state(training["state"]),
+    "done": lambda training: f"{100 * training['progress']:.0f} %",
+    "figures": _figures,
+}

@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from l3ps_cli.client import Client
+from l3ps_client import Client, Job, Training
 
-FINAL = ("succeeded", "failed", "cancelled")
 _POLL_SECONDS = 0.5
+Work = TypeVar("Work", bound=Mapping[str, Any])
 
 
-def wait_for_job(
-    client: Client, job_id: str, console: Console, check: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+def wait_for_job(client: Client, job_id: str, console: Console, check: Callable[[], None] | None = None) -> Job:
     """Show a job's progress until it is over; returns its last document.
 
     Args:
         client: the service.
         job_id: the job.
         console: where the bars go.
-        check: called between polls; may raise to give up (the embedded stack's health).
+        check: called every half second; may raise to give up (the embedded stack's health).
     """
-    return _wait(client, f"/jobs/{job_id}", stages_of, console, check)
+    jobs = client.jobs.watch(job_id, poll=_POLL_SECONDS if check else None)
+    return _show_all(jobs, stages_of, console, check or (lambda: None))
 
 
-def wait_for_training(client: Client, training_id: str, console: Console) -> dict[str, Any]:
+def wait_for_training(client: Client, training_id: str, console: Console) -> Training:
     """Show a training's progress and figures until it is over; returns its last document."""
-    return _wait(client, f"/trainings/{training_id}", _stage_of_training, console, lambda: None)
+    return _show_all(client.trainings.watch(training_id), _stage_of_training, console, lambda: None)
 
 
-def _stage_of_training(training: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _stage_of_training(training: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     figures = " ".join(f"{name} {value:.3g}" for name, value in training["figures"].items() if _is_number(value))
     yield training["name"], training["stage"] | {"figures": figures}
 
@@ -43,13 +41,12 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _wait(
-    client: Client,
-    path: str,
-    stages: Callable[[dict[str, Any]], Iterator[tuple[str, dict[str, Any]]]],
+def _show_all(
+    documents: Iterable[Work],
+    stages: Callable[[Mapping[str, Any]], Iterator[tuple[str, dict[str, Any]]]],
     console: Console,
     check: Callable[[], None],
-) -> dict[str, Any]:
+) -> Work:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
@@ -59,17 +56,14 @@ def _wait(
     )
     with Progress(*columns, console=console) as progress:
         bars: dict[str, TaskID] = {}
-        while True:
-            document = client.get(path)
+        for document in documents:
             for label, stage in stages(document):
                 _show(progress, bars, label, stage)
-            if document["state"] in FINAL:
-                return document
             check()
-            time.sleep(_POLL_SECONDS)
+        return document
 
 
-def stages_of(job: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+def stages_of(job: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """(label, stage document) of every stage of a job, in the order in which they run."""
     own = {stage["name"]: stage for stage in job["stages"]}
     if "ingest" in own:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,13 @@ from celery import signals  # noqa: E402
 from l3ps_platform import workflow  # noqa: E402
 from l3ps_platform.catalog import Catalog, StageName, stages  # noqa: E402
 from l3ps_platform.errors import PlatformError  # noqa: E402
-from l3ps_platform.processes import die_with  # noqa: E402
+from l3ps_platform.processes import die_with, is_child  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
+from l3ps_worker.scratch import Scratch  # noqa: E402
 
 log = structlog.get_logger(__name__)
 
@@ -40,6 +42,8 @@ app.conf.worker_concurrency = settings.concurrency
 _stopping = StopFlag()  # made before the fork, so that the children share it
 _main_pid = os.getpid()
 _context: Context | None = None
+_NO_MEMORY = 77
+"""Exit status of a child that ran out of memory."""
 
 
 def context() -> Context:
@@ -57,6 +61,9 @@ def _run(stage_id: str, attempt: int) -> None:
     except PlatformError as error:
         # The catalog is away. The message is spent; the reconciler sends another when the row still says queued.
         log.warning("stage not recorded", stage=stage_id, reason=str(error))
+    except MemoryError:
+        # Too little is left even to record it. Celery would take the whole worker down and see the message again.
+        os._exit(_NO_MEMORY)
 
 
 for _stage, _task_name in TASK_NAMES.items():
@@ -74,6 +81,7 @@ def _after_fork(**_: Any) -> None:
     global _context  # noqa: PLW0603
     _context = None
     die_with(_main_pid)
+    os.nice(settings.nice)
     cv2.setNumThreads(settings.threads)
 
 
@@ -91,19 +99,47 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
     """
     if not isinstance(exception, WorkerLostError | TimeLimitExceeded) or not args:
         return
-    if isinstance(exception, TimeLimitExceeded):
-        reason = f"it ran for more than {_limit(exception):.0f} s and was stopped"
-    else:
-        reason = "its worker process was killed, most likely for using too much memory"
-    log.warning("child lost", stage=args[0], reason=reason)
-    retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
+    reason, cause = _ending(exception)
+    log.warning("child lost", stage=args[0], reason=reason, cause=cause.value)
+    retry = workflow.Retry.of(settings)
     with _briefly() as tx:
-        workflow.lease_lost(tx, args[0], retry, owner_prefix=owner_prefix(_main_pid), reason=reason)
+        for stage_id, owner in stages.owned(tx.session, owner_prefix(_main_pid)):
+            # Given back before the child died, the stage may be in the hands of another one by now.
+            if stage_id == args[0] and not is_child(int(owner.rpartition(":")[2]), _main_pid):
+                workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner, reason=reason, cause=cause)
 
 
-def _limit(error: TimeLimitExceeded) -> float:
-    """The seconds that were too many."""
-    return float(error.args[0]) if error.args and isinstance(error.args[0], int | float) else settings.stage_seconds
+def _ending(error: WorkerLostError | TimeLimitExceeded) -> tuple[str, workflow.Cause]:
+    """What befell a child, for the user and in one word."""
+    if isinstance(error, TimeLimitExceeded):
+        known = error.args and isinstance(error.args[0], int | float)
+        limit = float(error.args[0]) if known else settings.stage_seconds
+        return f"it ran for more than {limit:.0f} s and was stopped", workflow.Cause.TIMEOUT
+    how = re.search(r"signal \d+ \((\w+)\)|exitcode (-?\d+)", str(error))
+    signal, status = how.groups() if how else (None, None)
+    if status == str(_NO_MEMORY) or (signal == "SIGKILL" and _killed_for_memory()):
+        return "its worker process ran out of memory; use smaller scenes or more memory", workflow.Cause.OUT_OF_MEMORY
+    ending = f"was killed by {signal}" if signal else f"ended with status {status}" if status else "ended"
+    return f"its worker process {ending} in mid-stage", workflow.Cause.CRASHED
+
+
+def _killed_for_memory() -> bool:
+    """Whether the kernel has killed a process for memory since this was last asked, in our control group or at all."""
+    global _memory_kills
+    before, _memory_kills = _memory_kills, _count_memory_kills()
+    return _memory_kills > before
+
+
+def _count_memory_kills() -> int:
+    for path in (Path("/sys/fs/cgroup/memory.events"), Path("/proc/vmstat")):
+        with suppress(OSError):
+            found = re.search(r"^oom_kill (\d+)$", path.read_text(), re.MULTILINE)
+            if found:
+                return int(found[1])
+    return 0
+
+
+_memory_kills = _count_memory_kills()
 
 
 @signals.worker_init.connect  # type: ignore[untyped-decorator]
@@ -114,7 +150,8 @@ def _begin(**_: Any) -> None:
     """
     atexit.register(Pulse(owner_prefix(_main_pid)).stop)
     atexit.register(_give_back_rest)  # the signal worker_shutdown is not sent when SIGQUIT ends the worker
-    retry = workflow.Retry(settings.max_attempts, settings.retry_seconds)
+    Scratch(settings.scratch, settings.scratch_bytes).sweep()
+    retry = workflow.Retry.of(settings)
     with _briefly() as tx:
         for stage_id, owner in stages.owned(tx.session, f"{socket.gethostname()}:"):
             pid = owner.split(":")[-2]

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable
 
-from l3ps.evaluate import PanopticEvaluator
+from l3ps.evaluate import PanopticEvaluator, mean_estimates
 from l3ps.progress import Progress
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Json, StageName, StageRow, StageState, bundles, jobs, stages
@@ -45,6 +45,7 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
         sha256 = hashlib.sha256(data).hexdigest()
         files.append({"path": path, "format": None, "size": len(data), "sha256": sha256, "key": key})
     quality = job_quality(scene.quality for scene, _ in finished)
+    estimates = mean_estimates(scan for scene in judged.values() for scan in scene["estimates"])
     manifest = {
         "job_id": job.id,
         "drive_id": job.drive_id,
@@ -60,7 +61,9 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     manifest_key = f"{prefix}/manifest.json"
     context.store.put_bytes(manifest_key, json.dumps(manifest, indent=1).encode())
     return Done(
-        lambda tx, claim, cost: workflow.complete(tx, claim, cost, output_key=manifest_key, quality=quality),
+        lambda tx, claim, cost: workflow.complete(
+            tx, claim, cost, output_key=manifest_key, quality=quality, estimates=estimates
+        ),
         scans=sum(scene.scans for scene, _ in finished),
         points=sum(scene.points for scene, _ in finished),
     )

@@ -1,6 +1,7 @@
 """The worker's pulse: ``python -m l3ps_worker.pulse``, one small process beside the pool, started by the main process.
 
-It prolongs the leases of the stages that the pool's children hold, as long as the children live. A thread in the child
+It prolongs the leases of the stages that the pool's children hold, as long as the children live, and kills a child that
+goes on with a job that was cancelled, because it is deep in compiled code or waits for a server. A thread in the child
 could not: hdbscan holds the interpreter lock, more than 120 s at a time for 1.8 M points on a busy machine, and a lease
 that runs out under a worker at work costs the whole stage. A child that lives but does not get on is the business of
 the time limit.
@@ -18,11 +19,12 @@ import time
 import structlog
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Catalog
+from l3ps_platform.catalog import Catalog, StageName, stages
 from l3ps_platform.errors import PlatformError
 from l3ps_platform.processes import die_with, is_child
 from l3ps_platform.settings import Settings, get_settings
 from l3ps_platform.telemetry import configure_logging
+from l3ps_worker.trainer import LEAVE_SECONDS
 
 log = structlog.get_logger(__name__)
 
@@ -56,6 +58,35 @@ class Pulse:
             self._process = subprocess.Popen(self._command)
 
 
+class Overdue:
+    """The children of ``parent`` that go on with what was cancelled.
+
+    Args:
+        owner_prefix: how the names of their owners begin.
+        parent: the worker's main process.
+        seconds: how long they may go on; those that train may in addition let the trainer write its checkpoint.
+    """
+
+    def __init__(self, owner_prefix: str, parent: int, seconds: float) -> None:
+        self._prefix, self._parent, self._seconds = owner_prefix, parent, seconds
+        self._since: dict[tuple[str, str], float] = {}
+
+    def kill(self, catalog: Catalog) -> int:
+        """Kill those whose time is up; how many. The main process then reports them, and their stages are cancelled."""
+        count, now = 0, time.monotonic()
+        with catalog.transaction() as tx:
+            asked = {(id, owner): name for id, owner, name in stages.cancelled_of(tx.session, self._prefix)}
+            self._since = {held: self._since.get(held, now) for held in asked}
+            for (id, owner), name in asked.items():
+                allowed = self._seconds + (LEAVE_SECONDS if name is StageName.TRAIN else 0.0)
+                pid = int(owner.rpartition(":")[2])
+                if now - self._since[id, owner] >= allowed and is_child(pid, self._parent):
+                    log.warning("killing a child that goes on after its job was cancelled", stage=id, pid=pid)
+                    os.kill(pid, signal.SIGKILL)
+                    count += 1
+        return count
+
+
 def beat(catalog: Catalog, owner_prefix: str, parent: int, lease_seconds: float) -> int:
     """Prolong the leases that living children of ``parent`` hold; how many."""
 
@@ -72,10 +103,12 @@ def main(owner_prefix: str, parent: int, settings: Settings) -> None:
     die_with(parent)
     configure_logging(settings, "pulse")
     catalog = Catalog(settings.catalog_url)
+    overdue = Overdue(owner_prefix, parent, settings.cancel_seconds)
     while True:
         time.sleep(settings.heartbeat_seconds)
         try:
             beat(catalog, owner_prefix, parent, settings.lease_seconds)
+            overdue.kill(catalog)
         except PlatformError as error:
             log.warning("heartbeat missed", reason=str(error))
         except Exception:

@@ -97,7 +97,8 @@ def _done(
     def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
         workflow.complete(tx, claim, cost, output_key=key, quality=quality)
 
-    return Done(finish, work.scene.scans, work.scene.points, cached=cached, steps=steps or {})
+    stored = sum(file["size"] for file in manifest["files"])
+    return Done(finish, work.scene.scans, work.scene.points, stored, cached=cached, steps=steps or {})
 
 
 def _primal(context: Context, work: SceneWork, folder: Path) -> list[ScanLabels]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import structlog
 
 from l3ps.costs import CostBook
-from l3ps.errors import Cancelled, InputError, ProcessingError
+from l3ps.errors import Cancelled, L3psError
 from l3ps.progress import Progress
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Json, StageName
-from l3ps_platform.errors import LeaseLost
+from l3ps_platform.errors import CatalogUnavailable, LeaseLost
 from l3ps_platform.telemetry import bound
 from l3ps_worker.context import Context
 from l3ps_worker.ingest import ingest
@@ -80,47 +81,53 @@ def _run_claimed(context: Context, claim: workflow.Claim) -> Outcome:
         return _cancelled(context, claim, _cost(book, done))
     except Stopping:
         return _released(context, claim)
-    except MemoryError:
-        # Left to Celery, a MemoryError takes down the worker's main process and comes back with the message for ever.
-        error = _error("the worker ran out of memory; use smaller scenes or a worker with more memory")
-        return _failed(context, claim, error, _cost(book, done), retry=True)
-    except (InputError, ProcessingError) as caught:
-        # The same input fails the same way: no second try.
-        return _failed(context, claim, workflow.error_json(caught), _cost(book, done), retry=False)
-    except TrainerLost as caught:
-        return _failed(context, claim, _error(str(caught)), _cost(book, done), retry=True)
     except Exception as caught:
-        log.exception("stage broke")
-        reason = f"{type(caught).__name__}: {caught}"
-        return _failed(context, claim, _error(reason), _cost(book, done), retry=True)
-    cost = _cost(book, done)
-    with context.catalog.transaction() as tx:
-        done.finish(tx, claim, cost)
+        # Also a MemoryError: left to Celery, it takes down the worker's main process and comes back with the message.
+        return _failed(context, claim, _error(caught), _cost(book, done))
+    cost, finish = _cost(book, done), done.finish
+    _record(context, lambda tx: finish(tx, claim, cost))
     log.info("stage done", seconds=round(cost.seconds, 3), points=cost.points, cached=cost.cached)
     done.afterwards()
     return "done"
 
 
+def _record(context: Context, write: Callable[[workflow.Transaction], None]) -> None:
+    """Write how a stage ended. A catalog that is away is waited for: what was done is worth more than this process.
+
+    Nothing else could be claimed meanwhile either. A worker that is to stop does not wait.
+    """
+    pause, deadline = 0.1, time.monotonic() + context.settings.outage_seconds
+    while True:
+        try:
+            with context.catalog.transaction() as tx:
+                return write(tx)
+        except CatalogUnavailable as error:
+            if context.stopping.is_set() or time.monotonic() > deadline:
+                raise
+            log.warning("outcome not recorded, trying again", reason=str(error))
+        time.sleep(pause)
+        pause = min(2 * pause, 5.0)
+
+
 def _cancelled(context: Context, claim: workflow.Claim, cost: workflow.Cost) -> Outcome:
-    with context.catalog.transaction() as tx:
-        workflow.cancelled(tx, claim, cost)
+    _record(context, lambda tx: workflow.cancelled(tx, claim, cost))
     log.info("stage cancelled")
     return "cancelled"
 
 
 def _released(context: Context, claim: workflow.Claim) -> Outcome:
-    with context.catalog.transaction() as tx:
-        workflow.release(tx, claim)
+    _record(context, lambda tx: workflow.release(tx, claim))
     log.info("stage given back")
     return "released"
 
 
-def _failed(context: Context, claim: workflow.Claim, error: Json, cost: workflow.Cost, *, retry: bool) -> Outcome:
-    settings = context.settings
-    again = workflow.Retry(settings.max_attempts, settings.retry_seconds) if retry else None
-    with context.catalog.transaction() as tx:
-        workflow.fail(tx, claim, error, retry=again, cost=cost)
-    log.warning("stage failed", reason=error["message"], retry=retry and claim.attempt < settings.max_attempts)
+def _failed(context: Context, claim: workflow.Claim, error: Json, cost: workflow.Cost) -> Outcome:
+    cause = workflow.Cause(error["cause"])
+    if cause is workflow.Cause.DISK_FULL:
+        context.scratch.free()
+    retry = None if cause.lasting else workflow.Retry.of(context.settings)
+    _record(context, lambda tx: workflow.fail(tx, claim, error, retry=retry, cost=cost))
+    log.warning("stage failed", reason=error["message"], cause=cause.value)
     return "failed"
 
 
@@ -135,10 +142,23 @@ def _cost(book: CostBook, done: Done | None) -> workflow.Cost:
         peak_mb=peak,
         scans=done.scans if done else 0,
         points=done.points if done else 0,
+        bytes=done.bytes if done else 0,
         cached=done.cached if done else False,
         steps=steps,
     )
 
 
-def _error(message: str) -> Json:
-    return {"message": message, "problems": []}
+def _error(caught: Exception) -> Json:
+    """What the row says about an exception that ended the stage."""
+    cause = workflow.cause_of(caught)
+    if isinstance(caught, TrainerLost):
+        return workflow.failure(str(caught), workflow.Cause.CRASHED)
+    if cause is workflow.Cause.OUT_OF_MEMORY:
+        message = "the worker ran out of memory; use smaller scenes or a worker with more memory"
+        return workflow.failure(message, cause)
+    if cause is workflow.Cause.DISK_FULL:
+        return workflow.failure(f"the disk is full; free some or use a larger one ({caught})", cause)
+    if isinstance(caught, L3psError):
+        return workflow.error_json(caught)
+    log.error("stage broke", exc_info=caught)
+    return workflow.failure(f"{type(caught).__name__}: {caught}", cause)

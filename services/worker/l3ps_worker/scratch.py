@@ -14,10 +14,12 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import structlog
+
+from l3ps_platform.workflow import disk_is_full
 
 log = structlog.get_logger(__name__)
 
@@ -57,6 +59,11 @@ class Scratch:
             os.utime(content.parent)
             yield content
 
+    def free(self) -> None:
+        """Delete every entry that is not in use, and what dead processes left."""
+        self._evict(0)
+        self.sweep()
+
     def drop(self, key: str) -> None:
         """Delete an entry unless it is in use."""
         with (self._locks / key).open("a+b") as lock:
@@ -69,11 +76,10 @@ class Scratch:
     @contextmanager
     def workdir(self) -> Iterator[Path]:
         """An empty folder that is gone after the block; those of dead processes are swept on the way."""
-        self._sweep()
+        self.sweep()
         folder = self._work / secrets.token_hex(8)
         lock_path = self._locks / f"work-{folder.name}"
-        with lock_path.open("a+b") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with self._own(lock_path):
             folder.mkdir()
             try:
                 yield folder
@@ -81,8 +87,41 @@ class Scratch:
                 shutil.rmtree(folder, ignore_errors=True)
                 lock_path.unlink(missing_ok=True)
 
+    def sweep(self) -> None:
+        """Delete the work folders of dead processes."""
+        for lock_path in self._locks.glob("work-*"):
+            try:
+                with lock_path.open("r+b") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(self._work / lock_path.name.removeprefix("work-"), ignore_errors=True)
+                    lock_path.unlink(missing_ok=True)
+            except (BlockingIOError, FileNotFoundError):
+                continue
+
+    @contextmanager
+    def _own(self, lock_path: Path) -> Iterator[None]:
+        """Hold a lock of this process' own; a sweep that came between its making and its locking took it away."""
+        while True:
+            with lock_path.open("a+b") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                with suppress(FileNotFoundError):
+                    if lock_path.stat().st_ino == os.fstat(lock.fileno()).st_ino:
+                        yield
+                        return
+
     def _make(self, key: str, make: Callable[[Path], object]) -> None:
-        self._evict()
+        """Make an entry; on a full disk once more with every entry deleted that nobody uses."""
+        self._evict(self._budget)
+        try:
+            self._fill(key, make)
+        except Exception as error:
+            if not disk_is_full(error):
+                raise
+            log.warning("scratch is full, deleting what is not in use", key=key)
+            self.free()
+            self._fill(key, make)
+
+    def _fill(self, key: str, make: Callable[[Path], object]) -> None:
         entry = self._cache / key
         shutil.rmtree(entry, ignore_errors=True)  # half of one that a killed process began
         entry.mkdir()
@@ -94,32 +133,22 @@ class Scratch:
             shutil.rmtree(entry, ignore_errors=True)
             raise
 
-    def _evict(self) -> None:
-        """Delete entries, the longest unused first, until the cache is within its budget."""
+    def _evict(self, budget: int) -> None:
+        """Delete entries, the longest unused first, until the cache is within a budget, in bytes."""
         entries = []
         for entry in self._cache.iterdir():
             try:
                 entries.append((entry.stat().st_mtime, int((entry / "size").read_text()), entry.name))
             except (OSError, ValueError):
-                continue  # being made or deleted in this moment
+                self.drop(entry.name)  # half of one that a killed process began; one being made is in use
         held = sum(size for _, size, _ in entries)
         for _, size, key in sorted(entries):
-            if held <= self._budget:
+            if held <= budget:
                 return
             self.drop(key)
             if not (self._cache / key).exists():
                 held -= size
                 log.info("scratch entry evicted", key=key, bytes=size)
-
-    def _sweep(self) -> None:
-        for lock_path in self._locks.glob("work-*"):
-            try:
-                with lock_path.open("r+b") as lock:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(self._work / lock_path.name.removeprefix("work-"), ignore_errors=True)
-                    lock_path.unlink(missing_ok=True)
-            except (BlockingIOError, FileNotFoundError):
-                continue
 
 
 def _size(path: Path) -> int:

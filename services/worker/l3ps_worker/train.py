@@ -6,13 +6,11 @@ import json
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import structlog
 
 from l3ps.drivelog import unpack
-from l3ps.errors import InputError, Problem
 from l3ps.progress import Progress
 from l3ps_platform import workflow
 from l3ps_platform.catalog import AnnotationsRow, annotation_sets, trainings
@@ -110,10 +108,8 @@ def _unpacked(context: Context, id: str, progress: Progress) -> Iterator[tuple[A
             archive = folder / "archive"
             sha256 = download(context, row.object_key, archive, row.size, progress)
             check_sha256(row.sha256, sha256, row.filename)
-            try:
-                unpack(archive, target, unpack_limits(context.settings), name=row.filename, progress=progress)
-            except InputError as error:
-                raise InputError([_of_images(problem) for problem in error.problems]) from error
+            limits = unpack_limits(context.settings)
+            unpack(archive, target, limits, name=row.filename, contents="images", progress=progress)
         with context.catalog.transaction() as tx:
             annotation_sets.lock(tx.session, id).sha256 = sha256
 
@@ -130,8 +126,3 @@ def _unpacked(context: Context, id: str, progress: Progress) -> Iterator[tuple[A
 def _row(context: Context, id: str) -> AnnotationsRow:
     with context.catalog.reading() as session:
         return annotation_sets.get(session, id)
-
-
-def _of_images(problem: Problem) -> Problem:
-    """What is wrong with an archive, in words for one that holds no drive log."""
-    return replace(problem, remedy=problem.remedy.replace("the log", "the annotations"))

@@ -31,6 +31,7 @@ class Done:
     Attributes:
         finish: writes the outcome, in one transaction with all that follows from it.
         scans, points: how much was processed.
+        bytes: what an ingest took in and other stages stored.
         cached: the output was there already.
         steps: (seconds, peak MB) of the steps inside.
         child_cpu_seconds: processor time of processes that the stage started.
@@ -40,6 +41,7 @@ class Done:
     finish: Finish
     scans: int = 0
     points: int = 0
+    bytes: int = 0
     cached: bool = False
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
     child_cpu_seconds: float = 0.0

@@ -259,6 +259,8 @@ def _pax(content: bytes) -> dict[str, str]:
         if not digits.isdigit() or int(digits) <= space - position:
             raise ArchiveFault("corrupt-archive", "it is corrupt: an extended header cannot be read")
         record = content[space + 1 : position + int(digits) - 1]
+        if content[position + int(digits) - 1 : position + int(digits)] != b"\n":
+            raise ArchiveFault("corrupt-archive", "it is corrupt: an extended header cannot be read")
         key, _, value = record.partition(b"=")
         records[key.decode("utf-8", "surrogateescape")] = value.decode("utf-8", "surrogateescape")
         position += int(digits)

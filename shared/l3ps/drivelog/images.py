@@ -7,6 +7,7 @@ well, because an interrupted copy keeps its header.
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -57,6 +58,8 @@ def image_size(path: Path) -> tuple[int, int]:
             raise BadImage(f"its header gives {width}x{height} pixels")
         if width * height > MAX_PIXELS:
             raise BadImage(f"its header gives {width}x{height} pixels, more than {MAX_PIXELS} in all")
+        if end is _PNG_END and head[29:33] != struct.pack(">I", zlib.crc32(head[12:29])):
+            raise BadImage("its PNG header is damaged: the checksum does not fit")
         if not _ends_with(file, end):
             raise BadImage("the image is cut short: its end marker is missing")
     return width, height

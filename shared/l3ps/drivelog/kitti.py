@@ -21,6 +21,9 @@ IMAGES: Final = (".png", ".jpg", ".jpeg")
 _LONGEST_TEXT: Final = 1 << 26
 """Bytes of a text file that are read at all; the longest real one, poses of 4,541 scans, has 0.9 MB."""
 
+_ENDLESS: Final = 1 << 62
+"""Microseconds: 146,000 years. Times beyond it do not fit the integers that the rest of the way counts in."""
+
 
 class TextError(ValueError):
     """A text file cannot be used; carries the problem."""
@@ -140,7 +143,7 @@ def read_seconds(path: Path, root: Path) -> list[int]:
     """Microseconds from lines that hold seconds.
 
     Raises:
-        TextError: missing, or a line that is no finite number.
+        TextError: missing, or a line that is no number, or not one that a clock shows.
     """
     stamps = []
     for number, line in enumerate(read_text(path, root, "timestamps").split("\n"), start=1):
@@ -148,6 +151,8 @@ def read_seconds(path: Path, root: Path) -> list[int]:
             continue
         try:
             stamps.append(round(float(line) * 1e6))
+            if abs(stamps[-1]) >= _ENDLESS:
+                raise ValueError("no clock shows this")
         except (ValueError, OverflowError) as error:
             raise TextError(_bad_line(path, root, number, "a number of seconds")) from error
     return stamps

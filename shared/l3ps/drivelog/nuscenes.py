@@ -57,7 +57,8 @@ def open_nuscenes(root: Path, version: Path, *, sweeps: bool = False) -> Drive:
             log.report("no-scans", "scene", f"scene {row['name']} has no usable LiDAR scan", scene=row["name"])
     if not scenes:
         empty = Problem("no-scans", log.where("scene"), "the log has no scene with a usable LiDAR scan", EXPORT)
-        raise DriveLogError(log.problems or empty)
+        spoilt = any(problem.severity != "warning" for problem in log.problems)
+        raise DriveLogError(log.problems if spoilt else [empty, *log.problems])
     height = float(np.median([scene.scans[0].lidar_to_ego[2, 3] for scene in scenes]))
     return Drive(
         root=root,

@@ -12,59 +12,37 @@ import gzip
 import shutil
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import BinaryIO, Final
 
 from ..errors import DriveLogError, Problem, ProcessingError
 from ..progress import Progress, silent
 from .archive_formats import ArchiveFault, Kind, Member, sniff, tar_members, zip_members
-from .archive_names import UnsafeName, member_path, shown
+from .archive_names import shown
 from .open import open_drive
 from .types import Drive
+from .unpack_sink import USUAL, Budget, Sink, UnpackLimits
 
 _ZSTD_WINDOW: Final = 1 << 27
 """Bytes of memory a zstd archive may ask for: what the zstd tool grants without ``--long``."""
-_REPORT_EVERY: Final = 1 << 22
-
-
-@dataclass(frozen=True, slots=True)
-class UnpackLimits:
-    """What an archive may grow to.
-
-    Attributes:
-        max_files: files and folders.
-        max_file_bytes: bytes of one file.
-        max_total_bytes: bytes of all files.
-        max_ratio: bytes unpacked per byte of archive. Point clouds and images stay below 3, labels below 50.
-        ratio_free_bytes: up to this size the ratio does not matter.
-    """
-
-    max_files: int = 1_000_000
-    max_file_bytes: int = 8 << 30
-    max_total_bytes: int = 512 << 30
-    max_ratio: float = 100.0
-    ratio_free_bytes: int = 64 << 20
-
-
 _REMEDY: Final = {
-    "not-an-archive": "Upload the log as .zip, .tar, .tar.gz or .tar.zst",
-    "empty-archive": "Pack the log's folder and try again",
+    "not-an-archive": "Upload the {contents} as .zip, .tar, .tar.gz or .tar.zst",
+    "empty-archive": "Pack the folder of the {contents} and try again",
     "truncated-archive": "Pack or upload it again; the copy is not complete",
     "corrupt-archive": "Pack or upload it again; the copy is damaged",
-    "encrypted-archive": "Pack the log without a password",
-    "unknown-compression": "Pack the log as an ordinary .zip, as .tar.gz, or as .tar.zst without --long",
-    "unsafe-path": "Pack the log's folder with plain relative names",
+    "encrypted-archive": "Pack the {contents} without a password",
+    "unknown-compression": "Pack the {contents} as an ordinary .zip, as .tar.gz, or as .tar.zst without --long",
+    "unsafe-path": "Pack the folder of the {contents} with plain relative names",
     "duplicate-path": "Pack every file once",
     "archive-link": "Pack the files themselves instead of links to them (tar: --dereference --hard-dereference)",
     "archive-device": "Pack files and folders only",
-    "archive-sparse": "Pack the log without --sparse",
-    "archive-bomb": "Pack the log itself; if this is one, ask for a higher limit of the compression ratio",
-    "too-many-files": "Split the log into several archives, or ask for a higher limit",
+    "archive-sparse": "Pack the {contents} without --sparse",
+    "archive-bomb": "Pack nothing but the {contents}; if it is, ask for a higher limit of the compression ratio",
+    "too-many-files": "Split the {contents} into several archives, or ask for a higher limit",
     "file-too-large": "Leave this file out, or ask for a higher limit",
-    "archive-too-large": "Split the log into several archives, or ask for a higher limit",
+    "archive-too-large": "Split the {contents} into several archives, or ask for a higher limit",
 }
 _OTHERS: Final = {b"BZh": "bzip2", b"\xfd7zXZ\0": "xz", b"7z\xbc\xaf\x27\x1c": "7-Zip", b"Rar!": "RAR"}
 
@@ -72,18 +50,20 @@ _OTHERS: Final = {b"BZh": "bzip2", b"\xfd7zXZ\0": "xz", b"7z\xbc\xaf\x27\x1c": "
 def unpack(
     archive: Path,
     target: Path,
-    limits: UnpackLimits = UnpackLimits(),
+    limits: UnpackLimits = USUAL,
     *,
     name: str | None = None,
+    contents: str = "log",
     progress: Progress = silent,
 ) -> Path:
-    """Unpack an archive of a drive log.
+    """Unpack an archive of a drive log, or of annotated images.
 
     Args:
         archive: the file; its kind is told by its first bytes, not by its name.
         target: the folder to make; it must not exist, or be empty. Its parent is made when missing.
         limits: what the archive may grow to.
         name: what messages call the archive, when that is not its file name.
+        contents: what remedies call what is in it.
         progress: told the bytes of the archive read (stage ``unpack``); may raise to stop.
 
     Returns:
@@ -94,26 +74,66 @@ def unpack(
         ProcessingError: the target's disk is full.
         FileExistsError: the target is there and not empty.
     """
+    with _all_or_nothing(target, name or archive.name, contents) as folder:
+        _unpack_into(archive, folder, limits, progress)
+    return target
+
+
+def gather(
+    members: Iterable[Member], target: Path, limits: UnpackLimits = USUAL, *, name: str, contents: str = "log"
+) -> Path:
+    """Write files that come one by one and are named by a stranger, as :func:`unpack` writes those of an archive.
+
+    Args:
+        members: the files.
+        target: as for :func:`unpack`.
+        limits: of files and bytes; the ratio means nothing here.
+        name: what messages call the place they come from.
+        contents: what remedies call what they are.
+
+    Returns:
+        The target.
+
+    Raises:
+        DriveLogError: no file, too many or too large ones, or one whose name is no plain one.
+        ProcessingError: the target's disk is full.
+        FileExistsError: the target is there and not empty.
+    """
+    with _all_or_nothing(target, name, contents) as folder:
+        budget = Budget(limits, None, lambda: 0, silent)
+        sink = Sink(folder, limits)
+        for member in members:
+            sink.take(member, budget.spend)
+        if not sink.files:
+            raise ArchiveFault("empty-archive", "there is no file in it")
+    return target
+
+
+@contextmanager
+def _all_or_nothing(target: Path, label: str, contents: str) -> Iterator[Path]:
+    """A folder that becomes the target when the block ends well; faults as errors, and nothing left of a bad end."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise FileExistsError(f"{target} exists and is not empty")
-    label = name or archive.name
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
     inner = partial / "log"  # the temporary folder itself is closed to others, the log is not
     try:
         inner.mkdir()
-        _unpack_into(archive, inner, limits, progress)
+        yield inner
         inner.rename(target)
     except ArchiveFault as fault:
         where = label if fault.member is None else f"{label}: {shown(fault.member)}"
-        raise DriveLogError(Problem(fault.code, where, fault.what, _REMEDY[fault.code])) from fault
+        raise _error(fault, where, contents) from fault
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise ProcessingError(f"{label}: there is no space left to unpack it in {target.parent}") from error
         raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return target
+
+
+def _error(fault: ArchiveFault, where: str, contents: str = "log") -> DriveLogError:
+    return DriveLogError(Problem(fault.code, where, fault.what, _REMEDY[fault.code].format(contents=contents)))
 
 
 def check_kind(head: bytes, size: int, name: str) -> Kind:
@@ -130,14 +150,14 @@ def check_kind(head: bytes, size: int, name: str) -> Kind:
     try:
         return _kind(head, size)
     except ArchiveFault as fault:
-        raise DriveLogError(Problem(fault.code, name, fault.what, _REMEDY[fault.code])) from fault
+        raise _error(fault, name) from fault
 
 
 @contextmanager
 def opened(
     path: Path,
     scratch: Path | None = None,
-    limits: UnpackLimits = UnpackLimits(),
+    limits: UnpackLimits = USUAL,
     *,
     sweeps: bool = False,
     skip_bad_scans: bool = False,
@@ -182,8 +202,8 @@ def _unpack_into(archive: Path, folder: Path, limits: UnpackLimits, progress: Pr
     with archive.open("rb") as file:
         kind = _kind(file.read(512), size)
         file.seek(0)
-        budget = _Budget(limits, size, file.tell, progress)
-        sink = _Sink(folder, limits)
+        budget = Budget(limits, size, file.tell, progress)
+        sink = Sink(folder, limits)
         for member in _members(kind, file, size, budget):
             sink.take(member, budget.spend if kind == "zip" else None)
     if not sink.files:
@@ -191,7 +211,7 @@ def _unpack_into(archive: Path, folder: Path, limits: UnpackLimits, progress: Pr
     progress("unpack", size, size)
 
 
-def _members(kind: Kind, file: BinaryIO, size: int, budget: _Budget) -> Iterator[Member]:
+def _members(kind: Kind, file: BinaryIO, size: int, budget: Budget) -> Iterator[Member]:
     if kind == "zip":
         yield from zip_members(file, size, budget.limits.max_files)
         return
@@ -229,88 +249,3 @@ def _translated(read: Callable[[int], bytes], errors: tuple[type[Exception], ...
             raise ArchiveFault("corrupt-archive", f"it is corrupt ({error})") from error
 
     return translating
-
-
-class _Budget:
-    """Counts real bytes against the limits of the whole archive, and tells the progress."""
-
-    def __init__(self, limits: UnpackLimits, size: int, position: Callable[[], int], progress: Progress) -> None:
-        self.limits = limits
-        self._size, self._position, self._progress = size, position, progress
-        self._spent, self._reported = 0, 0
-        self._by_ratio = max(limits.ratio_free_bytes, int(limits.max_ratio * size))
-
-    def spend(self, count: int) -> None:
-        self._spent += count
-        if self._spent > self.limits.max_total_bytes:
-            raise ArchiveFault("archive-too-large", f"it unpacks to more than {self.limits.max_total_bytes} bytes")
-        if self._spent > self._by_ratio:
-            what = f"it unpacks to more than {self.limits.max_ratio:g} times its size"
-            raise ArchiveFault("archive-bomb", what)
-        if self._spent - self._reported >= _REPORT_EVERY:
-            self._reported = self._spent
-            self._progress("unpack", min(self._position(), self._size), self._size)
-
-    def counted(self, read: Callable[[int], bytes]) -> Callable[[int], bytes]:
-        def counting(count: int) -> bytes:
-            data = read(count)
-            self.spend(len(data))
-            return data
-
-        return counting
-
-
-class _Sink:
-    """Writes members below a folder."""
-
-    def __init__(self, folder: Path, limits: UnpackLimits) -> None:
-        self._folder = folder
-        self._limits = limits
-        self._made = {PurePosixPath(".")}
-        self.files = 0
-
-    def take(self, member: Member, spend: Callable[[int], None] | None) -> None:
-        """Write one member; ``spend`` is told the bytes of a format whose stream is not counted already."""
-        try:
-            path = member_path(member.name)
-        except UnsafeName as error:
-            raise ArchiveFault("unsafe-path", f"the member's name {error}", member.name) from error
-        try:
-            if member.is_folder:
-                self._make(path)
-            elif path == PurePosixPath("."):
-                raise ArchiveFault("unsafe-path", "the member's name is empty", member.name)
-            else:
-                self._make(path.parent)
-                self._write(self._folder / path, member, spend)
-        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            what = "the archive has this path twice, or as a file and as a folder"
-            raise ArchiveFault("duplicate-path", what, member.name) from error
-
-    def _make(self, path: PurePosixPath) -> None:
-        if path in self._made:
-            return
-        for folder in (*reversed(path.parents), path):
-            if folder not in self._made:
-                self._count()
-                (self._folder / folder).mkdir(exist_ok=True)
-                self._made.add(folder)
-
-    def _write(self, path: Path, member: Member, spend: Callable[[int], None] | None) -> None:
-        self._count()
-        written = 0
-        with path.open("xb") as out:
-            for chunk in member.chunks():
-                written += len(chunk)
-                if written > self._limits.max_file_bytes:
-                    what = f"the member is larger than {self._limits.max_file_bytes} bytes"
-                    raise ArchiveFault("file-too-large", what, member.name)
-                if spend is not None:
-                    spend(len(chunk))
-                out.write(chunk)
-        self.files += 1
-
-    def _count(self) -> None:
-        """One more file or folder; folders that a member's path implies count too."""
-        if self.files + len(self._made) > self._limits.max_files:
-            raise ArchiveFault("too-many-files", f"it has more than {self._limits.max_files} files and folders")

@@ -27,7 +27,7 @@ drives, mean of the drives and all scans).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -180,6 +180,26 @@ def seen_twice(cameras: NDArray[np.uint8], agree: NDArray[np.bool_]) -> NDArray[
         agree: (N,) bool, whether they see one class.
     """
     return np.where(cameras >= 2, agree, -1).astype(np.int8)
+
+
+def mean_estimates(scans: Iterable[Mapping[str, object]]) -> dict[str, float] | None:
+    """Each figure's mean over the scans that have it; None where no scan has any.
+
+    Args:
+        scans: :meth:`ScanEstimate.as_dict` of each.
+
+    Returns:
+        Shares in 0..1 by name, and under ``scans`` how many have an estimate.
+    """
+    known: dict[str, list[float]] = {}
+    for scan in scans:
+        for name, value in scan.items():
+            if isinstance(value, int | float):
+                known.setdefault(name, []).append(float(value))
+    if "estimate" not in known:
+        return None
+    means = {name: sum(values) / len(values) for name, values in known.items()}
+    return means | {"scans": float(len(known["estimate"]))}
 
 
 def rank_correlation(estimates: Sequence[float | None], truths: Sequence[float | None]) -> float | None:

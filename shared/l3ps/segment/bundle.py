@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from l3ps.errors import ModelError, Problem
 from l3ps.segment.external import PLAIN_NAME, external_tensors
@@ -43,8 +43,8 @@ class InputSpec(BaseModel):
     height: int = Field(gt=0, le=8192)
     width: int = Field(gt=0, le=8192)
     range: Literal["0..1", "0..255"] = "0..1"
-    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    mean: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.0, 0.0, 0.0)
+    std: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (1.0, 1.0, 1.0)
 
     @model_validator(mode="after")
     def _usable(self) -> InputSpec:

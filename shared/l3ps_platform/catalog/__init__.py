@@ -2,7 +2,8 @@
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
 ``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
-``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``. What changes states is in
+``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction
+writes through ``outbox``), ``webhooks``. What changes states is in
 :mod:`l3ps_platform.workflow`.
 """
 
@@ -10,6 +11,7 @@ from l3ps_platform.catalog import (
     annotation_sets,
     bundles,
     drives,
+    events,
     figures,
     jobs,
     keys,
@@ -19,9 +21,13 @@ from l3ps_platform.catalog import (
     stages,
     trainings,
     uploads,
+    webhooks,
 )
 from l3ps_platform.catalog.access_rows import ApiKeyRow, RequestRow
+from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
 from l3ps_platform.catalog.base import Base, Json, Owned
+from l3ps_platform.catalog.event_rows import DeliveryRow, EventRow, WebhookRow
+from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -38,6 +44,7 @@ from l3ps_platform.catalog.models import (
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -52,15 +59,22 @@ __all__ = [
     "QUEUE_OF",
     "AnnotationsRow",
     "ApiKeyRow",
+    "AttemptRow",
     "Base",
     "Catalog",
+    "DeliveryRow",
+    "DeliveryState",
     "DriveRow",
     "DriveState",
+    "EventKind",
+    "EventRow",
     "JobRow",
     "JobState",
     "Json",
+    "ModelFiguresRow",
     "ModelRow",
     "ModelState",
+    "Outcome",
     "Owned",
     "ProjectRow",
     "QueueName",
@@ -76,9 +90,11 @@ __all__ = [
     "Transaction",
     "UploadRow",
     "UploadState",
+    "WebhookRow",
     "annotation_sets",
     "bundles",
     "drives",
+    "events",
     "figures",
     "jobs",
     "keys",
@@ -88,4 +104,5 @@ __all__ = [
     "stages",
     "trainings",
     "uploads",
+    "webhooks",
 ]

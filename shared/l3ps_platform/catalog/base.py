@@ -11,6 +11,7 @@ from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import DeclarativeBase, Mapped, declared_attr, mapped_column
 
 from l3ps_platform.catalog.states import (
+    DeliveryState,
     DriveState,
     JobState,
     ModelState,
@@ -75,6 +76,7 @@ class Base(DeclarativeBase):
         StageState: _states(StageState),
         StageName: _states(StageName),
         QueueName: _states(QueueName),
+        DeliveryState: _states(DeliveryState),
     }
 
 

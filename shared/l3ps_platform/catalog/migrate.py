@@ -8,7 +8,7 @@ from __future__ import annotations
 import fcntl
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ def upgrade(url: str, revision: str = "head") -> None:
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _without_foreign_keys)
     try:
-        with _alone(engine), engine.begin() as connection:
+        with _alone(engine), _copied(engine), engine.begin() as connection:
             if connection.dialect.name == "postgresql":
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
             if not is_current(connection):
@@ -51,6 +51,25 @@ def _alone(engine: Engine) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _copied(engine: Engine) -> Iterator[None]:
+    """A copy of a SQLite catalog of an older release beside it, ``catalog.db.before-REVISION``: the way back.
+
+    PostgreSQL changes its schema in one transaction, and whoever runs it has a back-up.
+    """
+    path = engine.url.database
+    if engine.dialect.name == "sqlite" and path and Path(path).exists():
+        with engine.connect() as connection:
+            current = MigrationContext.configure(connection).get_current_revision()
+            known = current is None or is_current(connection)
+        copy = Path(f"{path}.before-{_head()}")
+        if not known and not copy.exists():
+            with closing(sqlite3.connect(path)) as source, closing(sqlite3.connect(f"{copy}.part")) as target:
+                source.backup(target)
+            Path(f"{copy}.part").replace(copy)
+    yield
+
+
 def _without_foreign_keys(connection: sqlite3.Connection, _record: Any) -> None:
     # A table that is made anew is dropped first, and the rows that refer to it would go with it.
     connection.execute("PRAGMA foreign_keys=OFF")
@@ -58,11 +77,14 @@ def _without_foreign_keys(connection: sqlite3.Connection, _record: Any) -> None:
 
 def is_current(connection: Connection) -> bool:
     """Whether the schema is the one this code expects."""
-    head = ScriptDirectory.from_config(_config(connection)).get_current_head()
-    return MigrationContext.configure(connection).get_current_revision() == head
+    return MigrationContext.configure(connection).get_current_revision() == _head()
 
 
-def _config(connection: Connection) -> Config:
+def _head() -> str | None:
+    return ScriptDirectory.from_config(_config()).get_current_head()
+
+
+def _config(connection: Connection | None = None) -> Config:
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
     config.attributes["connection"] = connection

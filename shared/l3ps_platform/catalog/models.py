@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from sqlalchemy import ForeignKey, Index, String, UniqueConstraint
+from sqlalchemy import ForeignKey, Index, String, UniqueConstraint, text
 from sqlalchemy.orm import Mapped, mapped_column
 
 from l3ps_platform.catalog.base import Base, Json, Owned
@@ -117,6 +117,9 @@ class AnnotationsRow(Owned, Base):
     deleted_at: Mapped[datetime | None]
 
 
+_JUDGED = text("quality IS NOT NULL")
+
+
 class JobRow(Owned, Base):
     """One labelling of one drive with one model.
 
@@ -127,7 +130,15 @@ class JobRow(Owned, Base):
 
     __tablename__ = "jobs"
     noun = "job"
-    __table_args__ = (Index(None, "state"), Index(None, "drive_id"), Index(None, "project_id", "id"))
+    __table_args__ = (
+        Index(None, "state"),
+        Index(None, "project_id", "id"),
+        Index(None, "project_id", "state", "id"),
+        Index(None, "drive_id", "id"),
+        Index(None, "model_id", "id"),
+        # Logs with truth are few; the metrics want the latest of their jobs.
+        Index("ix_jobs_with_quality", "id", sqlite_where=_JUDGED, postgresql_where=_JUDGED),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     drive_id: Mapped[str] = mapped_column(ForeignKey("drives.id"))
@@ -194,13 +205,18 @@ class StageRow(Base):
     train stage a training.
     ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
     count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
+    ``attempt`` only rises, so that no late message fits; ``failures`` counts the attempts that failed by a fault of the
+    stage's own, and ``outage_since`` is when what it stands on began to fail it (l3ps_platform.workflow.causes).
     """
 
     __tablename__ = "stages"
     __table_args__ = (
         Index(None, "state", "lease_until"),
+        Index(None, "state", "name", "queued_at"),
         Index(None, "job_id"),
         Index(None, "scene_id"),
+        Index(None, "drive_id"),
+        Index(None, "model_id"),
         Index(None, "training_id"),
     )
 
@@ -214,6 +230,8 @@ class StageRow(Base):
     queue: Mapped[QueueName]
     state: Mapped[StageState] = mapped_column(default=StageState.WAITING)
     attempt: Mapped[int] = mapped_column(default=1)
+    failures: Mapped[int] = mapped_column(default=0, server_default="0")
+    outage_since: Mapped[datetime | None]
     not_before: Mapped[datetime | None]
     lease_owner: Mapped[str | None]
     lease_until: Mapped[datetime | None]

@@ -16,7 +16,9 @@ from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
-from l3ps_platform.catalog.base import Owned
+from l3ps_platform.catalog.base import Json, Owned
+from l3ps_platform.catalog.kinds import EventKind
+from l3ps_platform.catalog.outbox import Happening, write
 from l3ps_platform.catalog.states import QueueName, StageName
 from l3ps_platform.errors import CatalogUnavailable
 
@@ -50,11 +52,17 @@ class Transaction:
         now: one time for everything the transaction writes, by the database server's clock, so that workers
             whose clocks disagree still agree on leases.
         outbox: messages to send after the commit.
+        happenings: events that go into the log with the commit.
     """
 
     session: Session
     now: datetime
     outbox: list[StageMessage] = field(default_factory=list)
+    happenings: list[Happening] = field(default_factory=list)
+
+    def emit(self, kind: EventKind, subject: Owned, data: Json) -> None:
+        """Something happened to a row: it goes into the log, and to webhooks, if and when the transaction commits."""
+        self.happenings.append(Happening(kind, subject, data))
 
 
 class Catalog:
@@ -89,6 +97,8 @@ class Catalog:
         with self._session(write=True) as session:
             transaction = Transaction(session, self.now(session))
             yield transaction
+            if transaction.happenings:
+                write(session, transaction.happenings, transaction.now)
             session.commit()
         self._flush(transaction.outbox)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, or_, select
 from sqlalchemy.orm import Session
 
-from l3ps_platform.catalog.models import StageRow, StepRow
+from l3ps_platform.catalog.models import JobRow, StageRow, StepRow, TrainingRow
 from l3ps_platform.catalog.states import StageName, StageState
 from l3ps_platform.errors import NotFound
 
@@ -23,6 +23,12 @@ def get(session: Session, id: str) -> StageRow:
 def of_job(session: Session, job_id: str) -> list[StageRow]:
     """All stages of a job, its scenes' and its own, in the order they were planned."""
     return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
+
+
+def of_job_and_drive(session: Session, job_id: str, drive_id: str) -> list[StageRow]:
+    """The stages that a job's client sees: the check of its drive, and :func:`of_job`."""
+    seen = or_(StageRow.job_id == job_id, StageRow.drive_id == drive_id)
+    return list(session.scalars(select(StageRow).where(seen).order_by(StageRow.id)))
 
 
 def of_scene(session: Session, scene_id: str) -> list[StageRow]:
@@ -66,6 +72,24 @@ def owned(session: Session, owner_prefix: str) -> list[tuple[str, str]]:
         StageRow.state == StageState.RUNNING, StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
     )
     return [(id, owner) for id, owner in session.execute(query) if owner is not None]
+
+
+def cancelled_of(session: Session, owner_prefix: str) -> list[tuple[str, str, StageName]]:
+    """(id, owner, name) of the running stages whose owner's name begins so and whose job or training is to stop.
+
+    Their rows are held until the transaction ends, so that no owner can go on to another stage meanwhile.
+    """
+    asked = or_(JobRow.cancel_requested.is_(True), TrainingRow.cancel_requested.is_(True))
+    query = (
+        select(StageRow.id, StageRow.lease_owner, StageRow.name)
+        .outerjoin(JobRow, JobRow.id == StageRow.job_id)
+        .outerjoin(TrainingRow, TrainingRow.id == StageRow.training_id)
+        .where(StageRow.state == StageState.RUNNING, asked)
+        .where(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
+        .order_by(StageRow.id)
+    )
+    rows = session.execute(query.with_for_update(of=StageRow))
+    return [(id, owner, name) for id, owner, name in rows if owner is not None]
 
 
 def steps(session: Session, stage_ids: Sequence[str]) -> dict[str, list[StepRow]]:

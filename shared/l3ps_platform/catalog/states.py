@@ -66,6 +66,14 @@ class StageState(StrEnum):
         return self in (StageState.DONE, StageState.FAILED, StageState.CANCELLED)
 
 
+class DeliveryState(StrEnum):
+    """The life of a webhook's delivery; a failed one can be replayed."""
+
+    PENDING = "pending"
+    DELIVERED = "delivered"
+    FAILED = "failed"
+
+
 class StageName(StrEnum):
     """What a stage does."""
 

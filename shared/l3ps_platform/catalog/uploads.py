@@ -54,6 +54,14 @@ def get(session: Session, id: str) -> UploadRow:
     return queries.get(session, UploadRow, id)
 
 
+def page(
+    session: Session, *, limit: int = 50, before: str | None = None, state: UploadState | None = None
+) -> list[UploadRow]:
+    """Uploads, newest first, after the cursor ``before`` (the last id of the page before)."""
+    chosen = [UploadRow.state == state] if state is not None else []
+    return queries.page(session, UploadRow, *chosen, limit=limit, before=before)
+
+
 def lock(session: Session, id: str) -> UploadRow:
     """One upload, held against concurrent changes until the transaction ends. NotFound."""
     return queries.lock(session, UploadRow, id)

@@ -1,16 +1,14 @@
 """The object store as a directory, for the embedded stack. The API answers its presigned URLs.
 
 DIR/objects/<key>            the objects
-DIR/multipart/<id>/00001     parts of uploads in progress, named by number; their md5 beside them
+DIR/multipart/<id>/          uploads in progress (l3ps_platform.objects.folder_uploads)
 DIR/tmp/                     half-written files; moved into place when complete
 DIR/secret                   the HMAC key of presigned URLs, readable by the owner only
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
@@ -20,32 +18,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from l3ps_platform.errors import ObjectMissing, StoreUnavailable, UploadError
-from l3ps_platform.objects.interface import ObjectInfo, Part
+from l3ps_platform.objects.files import Incoming, append, disk_errors, half_written, to_disk, write_all
+from l3ps_platform.objects.folder_uploads import FolderUploads
+from l3ps_platform.objects.interface import ObjectInfo, Part, Pending
 from l3ps_platform.objects.keys import check_key, check_prefix
 from l3ps_platform.objects.signing import Grant, Signer
-
-_CHUNK = 1 << 20
-_UPLOAD_ID = re.compile(r"[0-9a-f]{32}")
-
-
-class Incoming:
-    """A body being received; written to a temporary file and hashed on the way."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._md5 = hashlib.md5(usedforsecurity=False)
-        self.size = 0
-
-    def write(self, data: bytes) -> None:
-        """Append a chunk."""
-        self._file.write(data)
-        self._md5.update(data)
-        self.size += len(data)
-
-    @property
-    def etag(self) -> str:
-        """md5 of what came so far, as S3 names parts."""
-        return self._md5.hexdigest()
 
 
 class DirectoryStore:
@@ -60,6 +37,8 @@ class DirectoryStore:
         self.root = root.absolute()
         self._base_url = base_url
         self._signer: Signer | None = None
+        self._tmp = self.root / "tmp"
+        self._uploads = FolderUploads(self.root / "multipart", self._tmp)
 
     @property
     def signer(self) -> Signer:
@@ -70,7 +49,7 @@ class DirectoryStore:
 
     def ensure(self) -> None:
         """Create the directories if they are missing."""
-        with _disk_errors():
+        with disk_errors():
             for name in ("objects", "multipart", "tmp"):
                 (self.root / name).mkdir(parents=True, exist_ok=True)
 
@@ -91,51 +70,55 @@ class DirectoryStore:
         """Take the body of a presigned PUT; it becomes the object or part on leaving without an exception."""
         target = self._path(grant.key)
         if grant.upload_id is not None:
-            target = self._upload(grant.upload_id, grant.key) / f"{grant.part:05d}"
-        with self._replacing(target) as file:
-            incoming = Incoming(file)
+            self._uploads.check(grant.key, grant.upload_id)
+        with half_written(self._tmp) as (file, path):
+            incoming = Incoming(file, grant.size)
             yield incoming
-        if grant.upload_id is not None:
-            target.with_suffix(".md5").write_text(incoming.etag)
+            incoming.check()
+            to_disk(file)
+            if grant.upload_id is not None:
+                self._uploads.put(grant.key, grant.upload_id, grant.part or 0, incoming.etag, path)
+            else:
+                _move(path, target)
 
     def put_file(self, key: str, path: Path) -> None:
         """Store a file."""
-        with path.open("rb") as source, self._replacing(self._path(key)) as file:
-            shutil.copyfileobj(source, file, _CHUNK)
+        with self._replacing(self._path(key)) as file, path.open("rb", buffering=0) as source:
+            append(file, source)
 
     def put_bytes(self, key: str, data: bytes) -> None:
         """Store bytes."""
         with self._replacing(self._path(key)) as file:
-            file.write(data)
+            write_all(file, data)
 
     def get_file(self, key: str, path: Path) -> None:
         """Fetch an object into a file."""
-        with self.open(key) as source, _disk_errors():
+        with self.open(key) as source, disk_errors():
             partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
             try:
-                with partial.open("wb") as file:
-                    shutil.copyfileobj(source, file, _CHUNK)
+                with partial.open("wb", buffering=0) as file:
+                    append(file, source)
                 partial.replace(path)
             finally:
                 partial.unlink(missing_ok=True)
 
     def get_bytes(self, key: str, offset: int = 0, length: int | None = None) -> bytes:
         """The object's bytes from ``offset`` on, at most ``length`` of them."""
-        with self.open(key) as file, _disk_errors():
-            file.seek(offset)
+        with self.open(key, offset) as file, disk_errors():
             return file.read(-1 if length is None else length)
 
     @contextmanager
-    def open(self, key: str) -> Iterator[BinaryIO]:
+    def open(self, key: str, offset: int = 0) -> Iterator[BinaryIO]:
         """A stream for reading."""
         path = self.path_of(key)
         try:
-            file = path.open("rb")
+            file = path.open("rb", buffering=0)
         except FileNotFoundError:
             raise ObjectMissing(key) from None
         except OSError as error:
             raise StoreUnavailable(f"the object store failed on {key!r}: {error}") from error
         with file:
+            file.seek(offset)
             yield file
 
     def stat(self, key: str) -> ObjectInfo:
@@ -158,7 +141,7 @@ class DirectoryStore:
     def delete(self, key: str) -> None:
         """Delete an object and the folders it leaves empty."""
         path = self._path(key)
-        with _disk_errors():
+        with disk_errors():
             path.unlink(missing_ok=True)
         with suppress(OSError):
             for folder in path.parents:
@@ -183,48 +166,47 @@ class DirectoryStore:
 
     def create_multipart(self, key: str) -> str:
         """Begin a multipart upload."""
-        check_key(key)
-        upload_id = secrets.token_hex(16)
-        with _disk_errors():
-            folder = self.root / "multipart" / upload_id
-            folder.mkdir(parents=True)
-            (folder / "key").write_text(key)
-        return upload_id
+        return self._uploads.create(check_key(key))
 
-    def presign_part(self, key: str, upload_id: str, number: int, seconds: int) -> str:
+    def presign_part(self, key: str, upload_id: str, number: int, seconds: int, size: int | None = None) -> str:
         """A URL of the API that stores the body of one PUT as a part."""
-        return self.signer.url(Grant("PUT", check_key(key), upload_id, number), seconds)
+        return self.signer.url(Grant("PUT", check_key(key), upload_id, number, size), seconds)
+
+    def list_parts(self, key: str, upload_id: str) -> Sequence[Part]:
+        """The parts that have arrived."""
+        with disk_errors():
+            return self._uploads.parts(check_key(key), upload_id)
+
+    def list_multipart(self) -> Iterator[Pending]:
+        """Multipart uploads in progress."""
+        with disk_errors():
+            yield from self._uploads.pending()
 
     def complete_multipart(self, key: str, upload_id: str, parts: Sequence[Part]) -> ObjectInfo:
         """Join the parts in the order of their numbers."""
-        folder = self._upload(upload_id, key)
-        ordered = sorted(parts, key=lambda part: part.number)
-        if not ordered or len({part.number for part in ordered}) != len(ordered):
-            raise UploadError("an upload is completed with each of its parts once")
-        for part in ordered:
-            stored = folder / f"{part.number:05d}.md5"
-            if not stored.is_file() or stored.read_text() != part.etag.strip('"'):
-                raise UploadError(f"part {part.number} was not uploaded, or its etag is another: upload it again")
         with self._replacing(self._path(key)) as file:
-            for part in ordered:
-                with (folder / f"{part.number:05d}").open("rb") as source:
-                    shutil.copyfileobj(source, file, _CHUNK)
-        shutil.rmtree(folder, ignore_errors=True)
+            self._uploads.join(key, upload_id, parts, file)
+        self._uploads.drop(upload_id)
         return self.stat(key)
 
     def abort_multipart(self, key: str, upload_id: str) -> None:
         """Drop an upload and its parts."""
         with suppress(UploadError):
-            shutil.rmtree(self._upload(upload_id, key), ignore_errors=True)
+            self._uploads.check(check_key(key), upload_id)
+            self._uploads.drop(upload_id)
+
+    def tidy(self, before: datetime) -> int:
+        """Delete what processes that died before then were writing."""
+        count = 0
+        for path in list(self._tmp.glob("*")):
+            with suppress(FileNotFoundError):
+                if datetime.fromtimestamp(path.stat().st_mtime, UTC) < before:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                    count += 1
+        return count
 
     def _path(self, key: str) -> Path:
         return self.root / "objects" / check_key(key)
-
-    def _upload(self, upload_id: str, key: str) -> Path:
-        folder = self.root / "multipart" / upload_id
-        if not _UPLOAD_ID.fullmatch(upload_id) or not (folder / "key").is_file() or (folder / "key").read_text() != key:
-            raise UploadError("there is no such upload: it was completed, aborted or has expired; begin a new one")
-        return folder
 
     def _info(self, key: str, path: Path) -> ObjectInfo:
         stat = path.stat()
@@ -233,22 +215,14 @@ class DirectoryStore:
     @contextmanager
     def _replacing(self, target: Path) -> Iterator[BinaryIO]:
         """A temporary file that takes the place of ``target`` when complete and on disk."""
-        with _disk_errors():
-            partial = self.root / "tmp" / secrets.token_hex(16)
-            partial.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with partial.open("xb") as file:
-                    yield file
-                    file.flush()
-                    os.fsync(file.fileno())
-                target.parent.mkdir(parents=True, exist_ok=True)
-                partial.replace(target)
-            finally:
-                partial.unlink(missing_ok=True)
+        with half_written(self._tmp) as (file, path):
+            yield file
+            to_disk(file)
+            _move(path, target)
 
     def _secret(self) -> bytes:
         path = self.root / "secret"
-        with _disk_errors():
+        with disk_errors():
             self.root.mkdir(parents=True, exist_ok=True)
             fresh = self.root / f".secret-{secrets.token_hex(8)}"
             try:
@@ -266,9 +240,12 @@ def _utc(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-@contextmanager
-def _disk_errors() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StoreUnavailable(f"the object store's disk failed: {error}") from error
+def _move(path: Path, target: Path) -> None:
+    while True:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.replace(target)
+            return
+        except FileNotFoundError:  # a deletion took the empty folder away in this moment
+            if not path.exists():
+                raise

@@ -22,10 +22,27 @@ class ObjectInfo:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One uploaded part of a multipart upload, as the client reports it (quotes around the etag do not matter)."""
+    """One part of a multipart upload: as the client reports it (quotes around the etag do not matter), or as stored.
+
+    ``etag`` is the md5 of the part's bytes in hex. ``size`` is known of stored parts only, bytes.
+    """
 
     number: int
     etag: str
+    size: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A multipart upload that was begun and neither completed nor aborted."""
+
+    key: str
+    upload_id: str
+    begun: datetime
+
+
+GONE = "there is no such upload: it was completed, aborted or has expired; begin a new one"
+"""What an UploadError says of an upload that the store does not know."""
 
 
 class ObjectStore(Protocol):
@@ -53,8 +70,11 @@ class ObjectStore(Protocol):
     def get_bytes(self, key: str, offset: int = 0, length: int | None = None) -> bytes:
         """The object's bytes from ``offset`` on, at most ``length`` of them. ObjectMissing."""
 
-    def open(self, key: str) -> AbstractContextManager[BinaryIO]:
-        """A stream for reading once, front to back. ObjectMissing."""
+    def open(self, key: str, offset: int = 0) -> AbstractContextManager[BinaryIO]:
+        """A stream for reading once, from ``offset`` to the end. ObjectMissing.
+
+        A stream that ends is complete: one that broke off raises StoreUnavailable at the read that finds out.
+        """
 
     def stat(self, key: str) -> ObjectInfo:
         """Size, etag and age. ObjectMissing."""
@@ -80,11 +100,23 @@ class ObjectStore(Protocol):
     def create_multipart(self, key: str) -> str:
         """Begin a multipart upload; returns its id."""
 
-    def presign_part(self, key: str, upload_id: str, number: int, seconds: int) -> str:
-        """A URL that stores the body of one PUT as part ``number`` (from 1); the reply's ETag names it."""
+    def presign_part(self, key: str, upload_id: str, number: int, seconds: int, size: int | None = None) -> str:
+        """A URL that stores the body of one PUT as part ``number`` (from 1); the reply's ETag names it.
+
+        With ``size`` the URL takes a body of exactly so many bytes and refuses every other.
+        """
+
+    def list_parts(self, key: str, upload_id: str) -> Sequence[Part]:
+        """The parts that have arrived, by number, with their sizes. UploadError when there is no such upload."""
+
+    def list_multipart(self) -> Iterator[Pending]:
+        """Multipart uploads in progress; of very many perhaps not all, but then others the next time."""
 
     def complete_multipart(self, key: str, upload_id: str, parts: Sequence[Part]) -> ObjectInfo:
         """Join the parts in the order of their numbers into one object. UploadError when they do not fit."""
 
     def abort_multipart(self, key: str, upload_id: str) -> None:
         """Drop an upload and its parts; nothing happens if there is none."""
+
+    def tidy(self, before: datetime) -> int:
+        """Delete what processes that died before then left half written, where the store keeps such; how much."""

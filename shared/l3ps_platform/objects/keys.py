@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import mimetypes
 import re
+from urllib.parse import quote
 
 from l3ps_platform.errors import InvalidKey
 
@@ -61,6 +62,11 @@ def segment(name: str) -> str:
     if len(quoted) > MAX_SEGMENT:
         quoted = f"{quoted[: MAX_SEGMENT - 40]}={hashlib.sha256(name.encode()).hexdigest()[:39]}"
     return quoted
+
+
+def attachment(filename: str) -> str:
+    """The Content-Disposition that makes a browser save a download under a name, whatever is in it (RFC 6266)."""
+    return f"attachment; filename*=UTF-8''{quote(filename, safe='')}"
 
 
 def content_type(key: str) -> str:

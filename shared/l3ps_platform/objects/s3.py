@@ -6,21 +6,23 @@ import io
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
+from contextlib import AbstractContextManager, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO, cast
-from urllib.parse import quote, urlsplit
 
 import urllib3
 from minio import Minio
 from minio.datatypes import Part as MinioPart
 from minio.deleteobjects import DeleteObject
 from minio.error import InvalidResponseError, MinioException, S3Error, ServerError
+from urllib3.response import BaseHTTPResponse
 
 from l3ps_platform.errors import ObjectMissing, StoreUnavailable, UploadError
-from l3ps_platform.objects.interface import ObjectInfo, Part
-from l3ps_platform.objects.keys import check_key, check_prefix, content_type
+from l3ps_platform.objects.interface import GONE, ObjectInfo, Part, Pending
+from l3ps_platform.objects.keys import attachment, check_key, check_prefix, content_type
+from l3ps_platform.objects.presign import Presigner
+from l3ps_platform.objects.s3_stream import S3Stream
 from l3ps_platform.settings import S3Location
 
 _CHUNK = 1 << 20
@@ -39,11 +41,10 @@ class S3Store:
     def __init__(self, location: S3Location, public_url: str | None = None) -> None:
         self._bucket = location.bucket
         self._where = f"{location.endpoint}/{location.bucket}"
-        self._client = _client(location, location.endpoint, location.secure)
-        self._public = self._client
-        if public_url:
-            parts = urlsplit(public_url)
-            self._public = _client(location, parts.netloc, parts.scheme == "https")
+        self._client = _client(location)
+        base = public_url or f"{'https' if location.secure else 'http'}://{location.endpoint}"
+        credentials = location.region, location.access_key, location.secret_key
+        self._presigner = Presigner(base.rstrip("/"), location.bucket, *credentials)
 
     def ensure(self) -> None:
         """Create the bucket if it is missing."""
@@ -87,24 +88,31 @@ class S3Store:
         """The object's bytes from ``offset`` on, at most ``length`` of them."""
         if length == 0:
             return b""
-        with self._errors(key):
-            response = self._client.get_object(self._bucket, check_key(key), offset=offset, length=length or 0)
-            try:
-                return response.read()
-            finally:
-                response.close()
-                response.release_conn()
+        with self._stream(key, offset, length) as stream:
+            return stream.read()
+
+    def open(self, key: str, offset: int = 0) -> AbstractContextManager[BinaryIO]:
+        """A stream for reading; it goes on by itself where a connection breaks off."""
+        return self._stream(key, offset)
 
     @contextmanager
-    def open(self, key: str) -> Iterator[BinaryIO]:
-        """A stream for reading; StoreUnavailable when the connection breaks off before the end."""
-        with self._errors(key):
-            response = self._client.get_object(self._bucket, check_key(key))
-            try:
-                yield cast(BinaryIO, response)
-            finally:
-                response.close()
-                response.release_conn()
+    def _stream(self, key: str, offset: int, length: int | None = None) -> Iterator[BinaryIO]:
+        def fetch(at: int, etag: str | None) -> BaseHTTPResponse:
+            condition: dict[str, str | list[str] | tuple[str]] = {} if etag is None else {"If-Match": etag}
+            rest = 0 if length is None else offset + length - at
+            with self._errors(key):
+                return self._client.get_object(
+                    self._bucket, key, offset=at, length=rest, request_headers=condition
+                )  # fmt: skip
+
+        check_key(key)
+        try:
+            stream = S3Stream(repr(key), fetch, offset)
+        except _BeyondEnd:
+            yield io.BytesIO()
+            return
+        with io.BufferedReader(stream, _CHUNK) as buffered:
+            yield cast(BinaryIO, buffered)
 
     def stat(self, key: str) -> ObjectInfo:
         """Size, etag and age."""
@@ -141,16 +149,14 @@ class S3Store:
 
     def presign_get(self, key: str, seconds: int, filename: str | None = None) -> str:
         """A URL that downloads the object."""
-        headers: dict[str, str | list[str] | tuple[str]] | None = None
+        query = {}
         if filename is not None:
-            headers = {"response-content-disposition": f"attachment; filename*=UTF-8''{quote(filename)}"}
-        return self._public.get_presigned_url(
-            "GET", self._bucket, check_key(key), timedelta(seconds=seconds), response_headers=headers
-        )
+            query["response-content-disposition"] = attachment(filename)
+        return self._presigner.url("GET", check_key(key), seconds, query=query)
 
     def presign_put(self, key: str, seconds: int) -> str:
         """A URL that stores the body of one PUT."""
-        return self._public.get_presigned_url("PUT", self._bucket, check_key(key), timedelta(seconds=seconds))
+        return self._presigner.url("PUT", check_key(key), seconds)
 
     # minio-py has no public face for the steps of a multipart upload; the underscored methods have been stable
     # since 7.0 and the dependency is held below 7.3.
@@ -162,15 +168,29 @@ class S3Store:
                 self._bucket, check_key(key), {"Content-Type": content_type(key)}
             )
 
-    def presign_part(self, key: str, upload_id: str, number: int, seconds: int) -> str:
+    def presign_part(self, key: str, upload_id: str, number: int, seconds: int, size: int | None = None) -> str:
         """A URL that stores the body of one PUT as a part."""
-        return self._public.get_presigned_url(
-            "PUT",
-            self._bucket,
-            check_key(key),
-            timedelta(seconds=seconds),
-            extra_query_params={"uploadId": upload_id, "partNumber": str(number)},
-        )
+        query = {"uploadId": upload_id, "partNumber": str(number)}
+        return self._presigner.url("PUT", check_key(key), seconds, query=query, length=size)
+
+    def list_parts(self, key: str, upload_id: str) -> Sequence[Part]:
+        """The parts that have arrived."""
+        found: list[Part] = []
+        marker, more = None, True
+        while more:
+            with self._errors(key):
+                page = self._client._list_parts(self._bucket, check_key(key), upload_id, part_number_marker=marker)
+            found += [Part(part.part_number, part.etag.strip('"'), part.size) for part in page.parts]
+            marker, more = page.next_part_number_marker, page.is_truncated
+        return sorted(found, key=lambda part: part.number)
+
+    def list_multipart(self) -> Iterator[Pending]:
+        """Multipart uploads in progress, the first thousand (MinIO knows no paging here, and no prefix)."""
+        with self._errors():
+            page = self._client._list_multipart_uploads(self._bucket)
+        for upload in page.uploads:
+            begun = upload.initiated_time or datetime.now(UTC)
+            yield Pending(upload.object_name, upload.upload_id or "", begun)
 
     def complete_multipart(self, key: str, upload_id: str, parts: Sequence[Part]) -> ObjectInfo:
         """Join the parts in the order of their numbers."""
@@ -181,7 +201,10 @@ class S3Store:
             self._client._complete_multipart_upload(
                 self._bucket, check_key(key), upload_id, [MinioPart(p.number, p.etag.strip('"')) for p in ordered]
             )
-        return self.stat(key)
+        try:
+            return self.stat(key)
+        except ObjectMissing:  # S3 may answer 200 and then report a failure in the body
+            raise StoreUnavailable(f"the object store {self._where} did not join the parts of {key!r}") from None
 
     def abort_multipart(self, key: str, upload_id: str) -> None:
         """Drop an upload and its parts."""
@@ -190,6 +213,10 @@ class S3Store:
                 self._client._abort_multipart_upload(self._bucket, check_key(key), upload_id)
         except UploadError:
             pass
+
+    def tidy(self, before: datetime) -> int:
+        """Nothing: a server tidies up after itself."""
+        return 0
 
     @contextmanager
     def _errors(self, key: str = "") -> Iterator[None]:
@@ -200,8 +227,9 @@ class S3Store:
             if error.code in ("NoSuchKey", "NoSuchObject"):
                 raise ObjectMissing(key) from None
             if error.code == "NoSuchUpload":
-                message = "there is no such upload: it was completed, aborted or has expired; begin a new one"
-                raise UploadError(message) from None
+                raise UploadError(GONE) from None
+            if error.code == "InvalidRange":
+                raise _BeyondEnd from None
             if error.code in _BAD_PARTS:
                 raise UploadError(f"the parts do not make an object ({error.message}): upload them again") from None
             raise StoreUnavailable(f"the object store {self._where} refused: {error.code}, {error.message}") from error
@@ -209,16 +237,21 @@ class S3Store:
             raise StoreUnavailable(f"the object store {self._where} does not answer: {error}") from error
 
 
-def _client(location: S3Location, endpoint: str, secure: bool) -> Minio:
-    # minio-py's own pool waits five minutes and tries five times: a dead server would hold a worker for long.
-    retries = urllib3.Retry(total=3, backoff_factor=0.2, status_forcelist=[500, 502, 503, 504])
-    timeout = urllib3.Timeout(connect=3, read=60)
+class _BeyondEnd(StoreUnavailable):
+    """A range that begins at or beyond the end of the object."""
+
+
+def _client(location: S3Location) -> Minio:
+    # minio-py's own pool waits five minutes and tries five times: a dead server would hold a worker for long. Here one
+    # that answers nothing at all is given up after a minute and a half, one that refuses connections within seconds.
+    retries = urllib3.Retry(total=3, read=2, backoff_factor=0.2, status_forcelist=[500, 502, 503, 504])
+    timeout = urllib3.Timeout(connect=3, read=30)
     return Minio(
-        endpoint,
+        location.endpoint,
         access_key=location.access_key,
         secret_key=location.secret_key.get_secret_value(),
-        secure=secure,
-        region=location.region,  # given, so that presigning needs no request
+        secure=location.secure,
+        region=location.region,  # given, so that no request is needed to find out
         http_client=urllib3.PoolManager(timeout=timeout, retries=retries, maxsize=8),
     )
 

@@ -26,6 +26,7 @@ class Grant:
         key: the object.
         upload_id: the multipart upload, for a PUT of a part.
         part: the part's number, from 1.
+        size: bytes that the body of a PUT must have, where that is fixed.
         filename: what the browser should save a download as.
     """
 
@@ -33,6 +34,7 @@ class Grant:
     key: str
     upload_id: str | None = None
     part: int | None = None
+    size: int | None = None
     filename: str | None = None
 
 
@@ -54,6 +56,8 @@ class Signer:
         query: dict[str, str] = {"expires": str(expires)}
         if grant.upload_id is not None:
             query |= {"upload": grant.upload_id, "part": str(grant.part)}
+        if grant.size is not None:
+            query["size"] = str(grant.size)
         if grant.filename is not None:
             query["filename"] = grant.filename
         query["signature"] = self._signature(grant, expires)
@@ -77,10 +81,11 @@ class Signer:
         try:
             expires = int(query["expires"])
             part = int(query["part"]) if "upload" in query else None
+            size = int(query["size"]) if "size" in query else None
             signature = query["signature"]
         except (KeyError, ValueError):
             raise InvalidSignature("this URL is not presigned: ask the API for one") from None
-        grant = Grant(verb, key, query.get("upload"), part, query.get("filename"))
+        grant = Grant(verb, key, query.get("upload"), part, size, query.get("filename"))
         if method not in ("GET", "HEAD", "PUT") or not hmac.compare_digest(
             self._signature(grant, expires).encode(), signature.encode("utf-8", "replace")
         ):
@@ -90,7 +95,8 @@ class Signer:
         return grant
 
     def _signature(self, grant: Grant, expires: int) -> str:
-        fields = (grant.method, grant.key, str(expires), grant.upload_id or "", str(grant.part or ""))
+        size = "" if grant.size is None else str(grant.size)
+        fields = (grant.method, grant.key, str(expires), grant.upload_id or "", str(grant.part or ""), size)
         # Each field with its length: no two grants share a text.
         text = "".join(f"{len(field)}:{field}" for field in (*fields, grant.filename or ""))
         return hmac.new(self._secret, text.encode(), hashlib.sha256).hexdigest()

@@ -4,15 +4,18 @@ Functions take a transaction and change rows.
 
 accept_drive, accept_model     an upload is complete → ingest
 submit_job, cancel_job,        what clients ask for
-  submit_training, cancel_training
+  retry_job, and the same of trainings
 claim, prolong, report       a worker takes a stage and says it is alive
 complete, drive_checked,       how it ended, and what follows from that
   model_checked, training_done,
   fail, cancelled
 Reconciler, lease_lost         what nobody is left to report
+Cause, cause_of                why an attempt failed, in one word
 """
 
 from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.workflow.again import outputs_to_keep, retry_job, retry_training
+from l3ps_platform.workflow.causes import Cause, cause_of, disk_is_full, failure
 from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, prolong, report
 from l3ps_platform.workflow.outcomes import (
     Cost,
@@ -31,6 +34,7 @@ from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 
 __all__ = [
+    "Cause",
     "Claim",
     "Cost",
     "Reconciler",
@@ -42,20 +46,26 @@ __all__ = [
     "cancel_job",
     "cancel_training",
     "cancelled",
+    "cause_of",
     "check_cancelled",
     "claim",
     "complete",
+    "disk_is_full",
     "drive_checked",
     "error_json",
     "fail",
+    "failure",
     "lease_lost",
     "model_checked",
     "note_training",
+    "outputs_to_keep",
     "problems_of",
     "prolong",
     "release",
     "release_owned",
     "report",
+    "retry_job",
+    "retry_training",
     "submit_job",
     "submit_training",
     "training_done",

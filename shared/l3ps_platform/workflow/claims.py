@@ -18,10 +18,16 @@ from sqlalchemy import CursorResult, Update, select, update
 
 from l3ps.errors import Cancelled
 from l3ps_platform.catalog import bundles, drives, jobs, stages, trainings
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost, NotFound
+from l3ps_platform.workflow import notices
+from l3ps_platform.workflow.attempts import note_end
+from l3ps_platform.workflow.causes import Cause, failure
+
+LOST = failure("the worker that ran this stage stopped answering", Cause.LEASE_LOST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +60,7 @@ def claim(
 ) -> Claim | None:
     """Take a stage, or None when it is not to be had: taken, finished, cancelled, or the message is an old one.
 
-    A running stage whose lease has run out is taken over; that counts as its next attempt, so a stage that kills
+    A running stage whose lease has run out is taken over; that counts as a failure of its own, so a stage that kills
     its workers does not go round for ever.
     """
     stage = tx.session.get(StageRow, stage_id)
@@ -78,10 +84,11 @@ def claim(
         taken = attempt
     else:
         abandoned = (StageRow.state == StageState.RUNNING, StageRow.lease_until < tx.now)
-        if attempt >= max_attempts or not changed(
-            tx, update(StageRow).where(*mine, *abandoned).values(**lease, attempt=attempt + 1)
-        ):
+        again = update(StageRow).where(*mine, *abandoned, StageRow.failures + 1 < max_attempts)
+        counted = {"attempt": attempt + 1, "failures": StageRow.failures + 1, "error": LOST}
+        if not changed(tx, again.values(**lease, **counted)):
             return None
+        note_end(tx, stage, Outcome.LOST, error=LOST)
         taken = attempt + 1
     _mark_parents_running(tx, stage, parent)
     return Claim(
@@ -188,6 +195,7 @@ def _mark_parents_running(tx: Transaction, stage: StageRow, parent: JobRow | Tra
     if parent is not None and parent.state is JobState.QUEUED:
         parent.state = JobState.RUNNING
         parent.started_at = tx.now
+        notices.of_parent(tx, parent)
     if stage.scene_id is not None:
         scene = tx.session.get(SceneRow, stage.scene_id)
         if scene is not None:

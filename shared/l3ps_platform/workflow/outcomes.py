@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 from sqlalchemy import delete, select, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
+from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import notices
+from l3ps_platform.workflow.attempts import note_again, note_end, note_figures
+from l3ps_platform.workflow.causes import Cause, failure, stored_cause
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
@@ -30,6 +35,7 @@ class Cost:
         cpu_seconds: processor time of the process, all threads.
         peak_mb: peak resident memory, MB.
         scans, points: what was processed.
+        bytes: what an ingest took in and other stages stored.
         cached: the output was there already and nothing was computed.
         steps: (seconds, peak MB) of each step inside the stage.
     """
@@ -39,20 +45,43 @@ class Cost:
     peak_mb: float = 0.0
     scans: int = 0
     points: int = 0
+    bytes: int = 0
     cached: bool = False
     steps: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Retry:
-    """How often a stage may be tried, and the wait before the second time; it doubles each time."""
+    """How often and how long a stage may be tried.
+
+    Attributes:
+        max_attempts: how often it may fail by a fault of its own: a crash, too little memory, a bug.
+        seconds: the wait before the second time; it doubles each time.
+        outage_seconds: how long it is tried while what it stands on is away; that uses up no attempt.
+        longest_seconds: the longest wait between two tries.
+    """
 
     max_attempts: int
     seconds: float
+    outage_seconds: float = 6 * 3600.0
+    longest_seconds: float = 60.0
+
+    @classmethod
+    def of(cls, settings: Settings) -> Retry:
+        """As the service's settings have it."""
+        return cls(
+            settings.max_attempts, settings.retry_seconds, settings.outage_seconds, settings.outage_retry_seconds
+        )
 
 
 def complete(
-    tx: Transaction, claim: Claim, cost: Cost, *, output_key: str | None = None, quality: Json | None = None
+    tx: Transaction,
+    claim: Claim,
+    cost: Cost,
+    *,
+    output_key: str | None = None,
+    quality: Json | None = None,
+    estimates: Json | None = None,
 ) -> None:
     """A segment, refine or publish stage is done: record it and enqueue what follows.
 
@@ -62,6 +91,7 @@ def complete(
         cost: what it cost.
         output_key: where its output lies.
         quality: for a refine stage the scene's, for a publish stage the job's.
+        estimates: for a publish stage what can be told of the job's labels without truth.
 
     Raises:
         LeaseLost: the stage is no longer ours; nothing was changed.
@@ -70,6 +100,7 @@ def complete(
     job = jobs.lock(tx.session, _must(stage.job_id))
     if stage.name is StageName.PUBLISH:
         job.quality = quality
+        note_figures(tx, job, quality, estimates)
     elif stage.scene_id is not None:
         scene = tx.session.get_one(SceneRow, stage.scene_id)
         if quality is not None:
@@ -79,6 +110,7 @@ def complete(
             enqueue(tx, waiting[0])
         elif not waiting:
             scene.state = StageState.DONE
+            notices.of_scene(tx, job, scene, stage)
     settle_job(tx, job)
 
 
@@ -94,12 +126,13 @@ def drive_checked(
     info: Json | None = None,
 ) -> None:
     """A drive's ingest is done: it is ready or rejected, and jobs that waited for it begin or fail. LeaseLost."""
-    stage = finish(tx, claim, StageState.DONE, cost=cost)
+    stage = finish(tx, claim, StageState.DONE, cost=cost, error=None if usable else _rejection(problems))
     drive = drives.lock(tx.session, _must(stage.drive_id))
     drive.state = DriveState.READY if usable else DriveState.REJECTED
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     drive.sha256, drive.format, drive.info = sha256, format, info
     tx.session.flush()
+    notices.of_upload(tx, drive)
     _plan_waiting(tx, drive_id=drive.id)
 
 
@@ -113,37 +146,51 @@ def model_checked(
     info: Json | None = None,
 ) -> None:
     """A model's ingest is done: it is rejected if there are problems, else ready. LeaseLost."""
-    stage = finish(tx, claim, StageState.DONE, cost=cost)
+    stage = finish(tx, claim, StageState.DONE, cost=cost, error=_rejection(problems) if problems else None)
     model = bundles.lock(tx.session, _must(stage.model_id))
     model.state = ModelState.REJECTED if problems else ModelState.READY
     model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     model.sha256, model.info = sha256, info
     tx.session.flush()
+    notices.of_upload(tx, model)
     _plan_waiting(tx, model_id=model.id)
 
 
 def fail(tx: Transaction, claim: Claim, error: Json, *, retry: Retry | None = None, cost: Cost | None = None) -> None:
-    """An attempt failed: it is tried again later if ``retry`` has attempts left, else the stage has failed.
+    """An attempt failed: it is tried again later if ``retry`` and the cause allow, else the stage has failed.
 
     A failed scene does not stop the others of its job. LeaseLost when the stage is no longer ours.
+
+    Args:
+        tx: the transaction.
+        claim: the stage.
+        error: ``{"message", "problems", "cause"}``; without a cause it counts as one of the stage's own.
+        retry: how often and how long it may be tried; None for not again.
+        cost: what it cost.
     """
-    again = retry is not None and claim.attempt < retry.max_attempts
-    stage = finish(tx, claim, StageState.WAITING if again else StageState.FAILED, cost=cost, error=error)
-    failed(tx, stage, retry if again else None)
+    failed(tx, finish(tx, claim, StageState.FAILED, cost=cost, error=error), retry)
 
 
-def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
-    """The consequences of a failed attempt whose row is already marked; ``retry`` when it is to be tried again."""
+def failed(tx: Transaction, stage: StageRow, retry: Retry | None, again: Outcome = Outcome.RETRIED) -> None:
+    """The consequences of a failed attempt whose row says so already, with its error.
+
+    Args:
+        tx: the transaction.
+        stage: the stage.
+        retry: how often and how long it may be tried; None for not again.
+        again: what the attempt is remembered as if another one follows.
+    """
     parent = lock_parents(tx, stage)
     if parent is not None and parent.cancel_requested:
-        stage.state = StageState.CANCELLED
+        stage.state, stage.error = StageState.CANCELLED, failure(_WAS_CANCELLED, Cause.CANCELLED)
         cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
         settle(tx, parent)
-    elif retry is not None:
-        stage.state = StageState.WAITING
-        stage.not_before = tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.attempt - 1))
+    elif retry is not None and (moment := _next_try(tx, stage, retry)) is not None:
+        note_again(tx, stage, again)
+        stage.state, stage.not_before, stage.finished_at = StageState.WAITING, moment, None
         stage.attempt += 1
         tx.session.flush()
+        notices.of_retry(tx, parent, stage)
     elif parent is not None:
         cancel_rest_of_scene(tx, stage, StageState.FAILED)
         settle(tx, parent)
@@ -153,7 +200,7 @@ def failed(tx: Transaction, stage: StageRow, retry: Retry | None) -> None:
 
 def cancelled(tx: Transaction, claim: Claim, cost: Cost | None = None) -> None:
     """The worker saw the cancel flag and stopped. LeaseLost when the stage is no longer ours."""
-    stage = finish(tx, claim, StageState.CANCELLED, cost=cost)
+    stage = finish(tx, claim, StageState.CANCELLED, cost=cost, error=failure(_WAS_CANCELLED, Cause.CANCELLED))
     cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
     parent = lock_parents(tx, stage)
     if parent is not None:
@@ -226,6 +273,7 @@ def finish(
         values["fraction"] = 1.0
     if not changed(tx, update(StageRow).where(*owned(claim)).values(**values)):
         raise LeaseLost(f"stage {claim.stage_id} attempt {claim.attempt} now belongs to another worker")
+    note_end(tx, stage, _OUTCOMES[state], cost=cost, error=error)
     if cost is not None:
         tx.session.execute(delete(StepRow).where(StepRow.stage_id == claim.stage_id))
         for name, (seconds, peak_mb) in cost.steps.items():
@@ -233,6 +281,35 @@ def finish(
     tx.session.flush()
     tx.session.refresh(stage)
     return stage
+
+
+_OUTCOMES = {
+    StageState.DONE: Outcome.DONE,
+    StageState.FAILED: Outcome.FAILED,
+    StageState.QUEUED: Outcome.RELEASED,
+    StageState.CANCELLED: Outcome.CANCELLED,
+}
+"""What the end of an attempt is called that left its stage in this state."""
+
+
+def _next_try(tx: Transaction, stage: StageRow, retry: Retry) -> datetime | None:
+    """Count a failure by its cause and say when the stage may run again; None for never."""
+    if stored_cause(stage.error).environmental:
+        stage.outage_since = stage.outage_since or tx.now
+        lasted = (tx.now - stage.outage_since).total_seconds()
+        wait = max(lasted, retry.seconds)  # as long as it has lasted: the waits double
+        return None if lasted >= retry.outage_seconds else tx.now + timedelta(seconds=min(wait, retry.longest_seconds))
+    stage.outage_since = None
+    stage.failures += 1
+    if stage.failures >= retry.max_attempts:
+        return None
+    return tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.failures - 1))
+
+
+def _rejection(problems: Sequence[Problem]) -> Json:
+    """What the stage of an upload that was refused says: the check itself did its work."""
+    why = f": {problems[0]}" if problems else ""
+    return failure(f"the check is done and the upload is rejected{why}", Cause.BAD_INPUT)
 
 
 def _plan_waiting(tx: Transaction, *, drive_id: str | None = None, model_id: str | None = None) -> None:
@@ -255,11 +332,16 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept
+        notices.of_upload(tx, drive)
     if stage.model_id is not None:
         model = bundles.lock(tx.session, stage.model_id)
         model.state, model.problem = ModelState.REJECTED, kept
+        notices.of_upload(tx, model)
     tx.session.flush()
     _plan_waiting(tx, drive_id=stage.drive_id, model_id=stage.model_id)
+
+
+_WAS_CANCELLED = "it was stopped because its job was cancelled"
 
 
 def _must(id: str | None) -> str:

@@ -13,6 +13,8 @@ from l3ps_platform.catalog.session import StageMessage, Transaction
 from l3ps_platform.catalog.states import QUEUE_OF, DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import NotFound
 from l3ps_platform.ids import new_id
+from l3ps_platform.workflow import notices
+from l3ps_platform.workflow.causes import cause_of, failure
 
 
 def accept_drive(
@@ -85,6 +87,7 @@ def submit_job(
         raise refusal
     tx.session.add(job)
     tx.session.flush()
+    notices.of_parent(tx, job)
     plan_if_ready(tx, job, drive, bundle)
     return job
 
@@ -99,6 +102,7 @@ def plan_if_ready(tx: Transaction, job: JobRow, drive: DriveRow, model: ModelRow
         job.state = JobState.FAILED
         job.error = error_json(refusal)
         job.finished_at = tx.now
+        notices.of_parent(tx, job)
         return
     if drive.state is not DriveState.READY or model.state is not ModelState.READY:
         return
@@ -129,6 +133,7 @@ def add_stage(tx: Transaction, name: StageName, **owner: str) -> StageRow:
     row.progress_done = row.progress_total = 0
     row.fraction = 0.0
     row.cached = False
+    row.failures = 0
     tx.session.add(row)
     tx.session.flush()
     return row
@@ -144,9 +149,9 @@ def enqueue(tx: Transaction, stage: StageRow) -> None:
 
 
 def error_json(error: BaseException) -> Json:
-    """An error as rows keep it: its sentence and, for bad input, every problem."""
+    """An error as rows keep it: its sentence, its cause and, for bad input, every problem."""
     problems = [p.as_dict() for p in error.problems] if isinstance(error, InputError) else []
-    return {"message": str(error) or type(error).__name__, "problems": problems}
+    return failure(str(error) or type(error).__name__, cause_of(error)) | {"problems": problems}
 
 
 def problems_of(stored: Json | None) -> list[Problem]:

@@ -6,6 +6,7 @@ Runs in a thread of the API; several may run at once, since every change is cond
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,13 +17,16 @@ import structlog
 from sqlalchemy import select, update
 
 from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
+from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
 from l3ps_platform.catalog.states import QueueName, StageState, UploadState
-from l3ps_platform.errors import Conflict, PlatformError
+from l3ps_platform.errors import CatalogUnavailable, Conflict, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
-from l3ps_platform.workflow.claims import changed, lock_parents
+from l3ps_platform.workflow.attempts import note_end
+from l3ps_platform.workflow.causes import Cause, failure
+from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
 
@@ -31,7 +35,6 @@ if TYPE_CHECKING:  # celery takes a third of a second to import, and only sender
 
 log = structlog.get_logger(__name__)
 
-LOST = {"message": "the worker that ran this stage stopped answering", "problems": []}
 BATCH = 200
 
 
@@ -61,15 +64,20 @@ class Reconciler:
         self._queue = queue
         self._store = store
         self._settings = settings
-        self._retry = Retry(settings.max_attempts, settings.retry_seconds)
+        self._retry = Retry.of(settings)
+        self._leases_count_from = float("-inf")
 
     def run(self, stop: threading.Event) -> None:
         """Rounds until ``stop`` is set; a round that fails is logged and the next one tries again."""
+        self._bear_old_leases()
         while not stop.wait(self._settings.reconcile_seconds):
             try:
                 report = self.run_once()
                 if report != Report():
                     log.info("reconciled", **{name: getattr(report, name) for name in Report.__slots__})
+            except CatalogUnavailable as error:
+                self._bear_old_leases()
+                log.warning("reconciler waits", reason=str(error))
             except PlatformError as error:
                 log.warning("reconciler waits", reason=str(error))
             except Exception:
@@ -85,7 +93,16 @@ class Reconciler:
             archives=self._delete_archives(),
         )
 
+    def _bear_old_leases(self) -> None:
+        """For a lease's time to come, do not conclude from one that has run out that its worker is gone.
+
+        While the catalog was away nobody could prolong any; and who has just started does not know whether it was.
+        """
+        self._leases_count_from = time.monotonic() + self._settings.lease_seconds
+
     def _expire_leases(self) -> int:
+        if time.monotonic() < self._leases_count_from:
+            return 0
         count = 0
         for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
             with self._catalog.transaction() as tx:
@@ -172,6 +189,7 @@ def lease_lost(
     expired_before: datetime | None = None,
     owner_prefix: str | None = None,
     reason: str | None = None,
+    cause: Cause = Cause.LEASE_LOST,
 ) -> bool:
     """End a running attempt whose worker is gone: tried again, failed for good, or cancelled with its job.
 
@@ -182,6 +200,7 @@ def lease_lost(
         expired_before: only if its lease ended before this.
         owner_prefix: only if its owner's name begins so (a worker's main process reports its own dead child).
         reason: what to tell the user.
+        cause: and in one word.
     """
     stage = tx.session.get(StageRow, stage_id)
     if stage is None:
@@ -192,10 +211,11 @@ def lease_lost(
         conditions.append(StageRow.lease_until < expired_before)
     if owner_prefix is not None:
         conditions.append(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
-    error = LOST if reason is None else {"message": reason, "problems": []}
+    error = LOST if reason is None else failure(reason, cause)
     values = {"state": StageState.FAILED, "lease_owner": None, "lease_until": None, "finished_at": tx.now}
     if not changed(tx, update(StageRow).where(*conditions).values(**values, error=error)):
         return False
+    note_end(tx, stage, Outcome.FAILED, error=error)
     tx.session.refresh(stage)
-    failed(tx, stage, retry if stage.attempt < retry.max_attempts else None)
+    failed(tx, stage, retry, Outcome.LOST)
     return True

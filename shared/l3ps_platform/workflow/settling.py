@@ -8,6 +8,7 @@ from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageName, StageState
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.planning import enqueue
 
 MAX_PROBLEMS = 100
@@ -19,6 +20,8 @@ def cancel_rest_of_scene(tx: Transaction, stage: StageRow, scene_state: StageSta
         return
     scene = tx.session.get_one(SceneRow, stage.scene_id)
     scene.state = scene_state
+    if scene_state is StageState.FAILED:
+        notices.of_scene(tx, tx.session.get_one(JobRow, scene.job_id), scene, stage)
     tx.session.execute(
         update(StageRow)
         .where(StageRow.scene_id == stage.scene_id, StageRow.state.in_((StageState.WAITING, StageState.QUEUED)))
@@ -46,7 +49,8 @@ def settle_job(tx: Transaction, job: JobRow) -> None:
         return
     counts = _scene_counts(tx, job.id)
     publish = _publish_stage(tx, job.id)
-    if job.cancel_requested:
+    # With the manifest written the results are out: a cancel that comes then comes too late.
+    if job.cancel_requested and not (publish is not None and publish.state is StageState.DONE):
         if not _running(tx, job.id):
             _finish(tx, job, JobState.CANCELLED)
         return
@@ -88,6 +92,7 @@ def _finish(tx: Transaction, parent: JobRow | TrainingRow, state: JobState) -> N
     parent.state = state
     parent.finished_at = tx.now
     tx.session.flush()
+    notices.of_parent(tx, parent)
 
 
 def _scene_counts(tx: Transaction, job_id: str) -> dict[StageState, int]:

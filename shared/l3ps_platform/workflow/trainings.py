@@ -12,6 +12,7 @@ from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import Conflict, LeaseLost
 from l3ps_platform.ids import new_id
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.claims import Claim, changed, owned
 from l3ps_platform.workflow.outcomes import Cost, cancelled, fail, finish
 from l3ps_platform.workflow.planning import add_stage, enqueue
@@ -61,6 +62,7 @@ def submit_training(
     )
     tx.session.add(row)
     tx.session.flush()
+    notices.of_parent(tx, row)
     enqueue(tx, add_stage(tx, StageName.TRAIN, training_id=row.id))
     return row
 
@@ -134,6 +136,7 @@ def training_done(
     model.state, model.info = ModelState.READY, {**info, "training": training.id, "report": report}
     finish(tx, claim, StageState.DONE, cost=cost, output_key=object_key)
     training.model_id, training.report = model.id, report
+    notices.of_upload(tx, model)
     settle_training(tx, training)
 
 

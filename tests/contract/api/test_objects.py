@@ -25,15 +25,6 @@ def test_an_object_comes_as_a_download_that_no_browser_renders(store):
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_a_part_of_an_object_can_be_asked_for(store):
-    store.put_bytes("test/numbers.bin", bytes(range(200)))
-    url = store.presign_get("test/numbers.bin", 60)
-    answer = httpx.get(url, headers={"range": "bytes=10-19"})
-    assert (answer.status_code, answer.content) == (206, bytes(range(10, 20)))
-    head = httpx.head(url)
-    assert (head.status_code, head.headers["content-length"]) == (200, "200")
-
-
 def test_an_expired_url_is_refused(service, store):
     store.put_bytes("test/old.bin", b"old")
     document = service.refused(httpx.get(store.presign_get("test/old.bin", -1)), 403, "invalid-signature")

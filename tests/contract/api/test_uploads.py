@@ -58,11 +58,15 @@ def test_an_empty_file_is_refused_at_once(service, nothing_kept):
     assert "0 bytes" in document["detail"]
 
 
-def test_a_file_that_arrives_empty_is_refused(service, nothing_kept):
+@pytest.mark.parametrize("length", [0, 9, 11])
+def test_a_part_of_another_size_than_announced_is_refused_by_its_url(service, nothing_kept, length):
     upload = service.announce(10)
-    parts = service.put_parts(upload, b"")
-    answer = service.http.post(f"/v1/uploads/{upload['id']}/complete", json={"parts": parts})
-    assert "0 bytes arrived" in service.refused(answer, 422, "wrong-size")["detail"]
+    assert httpx.put(upload["parts"][0]["url"], content=bytes(length)).is_client_error
+    path = f"/v1/uploads/{upload['id']}"
+    assert service.http.get(path).json()["received"] == []
+    document = service.refused(service.http.post(f"{path}/complete", json={}), 422, "invalid-parts")
+    assert "1 of 1 parts have not arrived" in document["detail"]
+    assert service.http.delete(path).status_code == 204
 
 
 def test_what_is_no_archive_is_refused_and_forgotten(service, nothing_kept):
@@ -82,12 +86,70 @@ def test_every_archive_is_known_by_its_first_bytes_not_its_name(service, head):
     assert answer.status_code == 202, answer.text
 
 
-def test_a_file_of_another_size_than_announced_is_refused(service, nothing_kept):
-    data = tar_of(a=b"x")
-    upload = service.announce(len(data) + 1)
-    parts = service.put_parts(upload, data)
-    answer = service.http.post(f"/v1/uploads/{upload['id']}/complete", json={"parts": parts})
-    service.refused(answer, 422, "wrong-size")
+def test_a_part_that_slipped_in_with_another_size_is_refused_and_forgotten(service, nothing_kept):
+    """An S3 server that does not look at a signed Content-Length takes it; the completion does not."""
+    upload = service.announce(10)
+    with service.catalog.reading() as session:
+        row = uploads.get(session, upload["id"])
+    unsized = service.store.presign_part(row.object_key, row.s3_upload_id, 1, 60)
+    assert httpx.put(unsized, content=bytes(11)).is_success
+    path = f"/v1/uploads/{upload['id']}"
+    document = service.refused(service.http.post(f"{path}/complete", json={}), 422, "wrong-size")
+    assert "11 bytes, 10 were announced" in document["detail"]
+    assert service.http.get(path).json()["state"] == "aborted"
+
+
+def test_an_upload_goes_on_after_its_client_died(service):
+    """All that is left is the upload's id: the rest is asked for, and only what is missing is sent."""
+    data = tar_of(blob=bytes(range(256)) * 4096 * 12)
+    upload = service.announce(len(data), "night.tar")
+    sent = upload["parts"][1]
+    body = data[upload["part_size"] : 2 * upload["part_size"]]
+    assert httpx.put(sent["url"], content=body).is_success
+
+    path = f"/v1/uploads/{upload['id']}"
+    assert upload["id"] in [
+        left["id"] for left in service.http.get("/v1/uploads", params={"state": "open"}).json()["items"]
+    ]
+    progress = service.http.get(path).json()
+    (received,) = progress["received"]
+    assert received == {"number": 2, "size": len(body), "etag": hashlib.md5(body).hexdigest()}
+    missing = sorted(set(range(1, progress["part_count"] + 1)) - {2})
+    answer = service.http.post(f"{path}/parts", json={"numbers": missing})
+    assert answer.status_code == 200, answer.text
+    assert [part["number"] for part in answer.json()["parts"]] == missing
+    service.put_parts(answer.json(), data)
+    answer = service.http.post(f"{path}/complete", json={"sha256": hashlib.sha256(data).hexdigest()})
+    assert answer.status_code == 202, answer.text
+    assert service.http.get(path).json()["state"] == "complete"
+    service.refused(service.http.post(f"{path}/parts", json={"numbers": [1]}), 409, "upload-closed")
+
+
+def test_an_upload_is_not_completed_before_all_has_arrived(service):
+    data = tar_of(blob=bytes(12 * MiB))
+    upload = service.announce(len(data))
+    service.put_parts({**upload, "parts": upload["parts"][:2]}, data)
+    path = f"/v1/uploads/{upload['id']}"
+    document = service.refused(service.http.post(f"{path}/complete", json={}), 422, "invalid-parts")
+    assert "1 of 3 parts have not arrived: 3" in document["detail"]
+    service.put_parts({**upload, "parts": upload["parts"][2:]}, data)
+    assert service.http.post(f"{path}/complete", json={}).status_code == 202
+
+
+@pytest.mark.parametrize("numbers", [[], [0], [4], [1, 10_001], ["x"]])
+def test_urls_are_given_for_parts_that_there_are(service, numbers):
+    upload = service.announce(12 * MiB)
+    answer = service.http.post(f"/v1/uploads/{upload['id']}/parts", json={"numbers": numbers})
+    assert answer.status_code == 422 and answer.json()["errors"][0]["where"].startswith("numbers")
+    service.http.delete(f"/v1/uploads/{upload['id']}")
+
+
+def test_a_file_s_name_is_nowhere_in_the_store(service):
+    upload = service.announce(10, "../../etc/passwd #1?.tar")
+    with service.catalog.reading() as session:
+        row = uploads.get(session, upload["id"])
+    assert (row.filename, row.object_key) == ("../../etc/passwd #1?.tar", f"uploads/{row.id}/archive")
+    service.http.delete(f"/v1/uploads/{upload['id']}")
 
 
 def test_a_wrong_etag_names_the_parts_and_the_upload_can_go_on(service):

@@ -24,7 +24,7 @@ from l3ps_platform.catalog import (
 from l3ps_platform.catalog import jobs as catalog_jobs
 from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.catalog.migrate import upgrade
-from l3ps_platform.errors import InvalidSignature, ObjectMissing, StoreError
+from l3ps_platform.errors import InvalidSignature, ObjectMissing, StoreError, UploadError
 from l3ps_platform.objects import OBJECTS_PATH, DirectoryStore, ObjectStore, open_store
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
@@ -41,7 +41,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStor
     directory = DirectoryStore(tmp_path / "store", "")
     directory.ensure()
     with ThreadingHTTPServer(("127.0.0.1", 0), _answering(directory)) as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         yield DirectoryStore(tmp_path / "store", f"http://127.0.0.1:{server.server_address[1]}")
         server.shutdown()
@@ -65,7 +65,7 @@ def _answering(store: DirectoryStore) -> type[BaseHTTPRequestHandler]:
             try:
                 with store.receive(self._grant()) as incoming:
                     incoming.write(body)
-            except InvalidSignature:
+            except (InvalidSignature, UploadError):
                 self._reply(403)
                 return
             self._reply(200, ETag=f'"{incoming.etag}"')

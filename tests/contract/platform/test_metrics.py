@@ -1,20 +1,28 @@
 """What Prometheus is told, computed from both databases and a real Redis."""
 
-from prometheus_client import CollectorRegistry
+from datetime import timedelta
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import func, select, update
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Catalog
-from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.catalog import AttemptRow, Catalog, StageRow, bundles
+from l3ps_platform.metrics import LATE, CatalogCollector
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 
+Found = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
-def scrape(catalog: Catalog, queue: Queue, jobs: int = 50) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    from prometheus_client import generate_latest
 
+def scrape(catalog: Catalog, queue: Queue, jobs: int = 50) -> Found:
+    return scraped(CatalogCollector(catalog, queue, jobs))
+
+
+def scraped(collector: CatalogCollector) -> Found:
     registry = CollectorRegistry()
-    registry.register(CatalogCollector(catalog, queue, jobs))
+    registry.register(collector)
     text = generate_latest(registry).decode()
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
@@ -31,8 +39,11 @@ def test_figures_of_a_finished_job(catalog: Catalog, play, sent, tidy) -> None:
         play.run(lambda tx, claim: workflow.complete(tx, claim, cost, quality=quality))
     found = scrape(catalog, tidy.queue)
     refine = (("stage", "refine"),)
-    assert found["l3ps_scans_total", refine] == 8
-    assert found["l3ps_points_total", refine] == 200
+    per_project = (("project", "prj_default"), *refine)
+    assert found["l3ps_scans_total", per_project] == 8
+    assert found["l3ps_points_total", per_project] == 200
+    assert found["l3ps_scenes_total", (("project", "prj_default"),)] == 2
+    assert found["l3ps_bytes_total", (("project", "prj_default"), ("stage", "ingest"))] == 18
     assert found["l3ps_stage_seconds_sum", refine] == 4.0
     assert found["l3ps_stage_seconds_count", refine] == 2
     assert found["l3ps_stage_seconds_bucket", (("le", "1.0"), *refine)] == 0
@@ -40,8 +51,8 @@ def test_figures_of_a_finished_job(catalog: Catalog, play, sent, tidy) -> None:
     assert found["l3ps_stage_cpu_seconds_total", refine] == 7.0
     assert found["l3ps_stage_peak_megabytes", refine] == 640.0
     assert found["l3ps_step_seconds_total", (("step", "vote"),)] == 0.25 * 5 + 0.5 * 2  # and the two ingests'
-    assert found["l3ps_jobs", (("state", "succeeded"),)] == 1
-    assert found["l3ps_jobs", (("state", "failed"),)] == 0
+    assert found["l3ps_jobs", (("project", "prj_default"), ("state", "succeeded"))] == 1
+    assert found["l3ps_jobs", (("project", "prj_default"), ("state", "failed"))] == 0
     assert found["l3ps_stages", (("stage", "segment"), ("state", "done"))] == 2
     labels = (("job_id", job), ("labels", "refined"), ("protocol", "nuscenes"))
     assert found["l3ps_job_pq", labels] == 42.5
@@ -51,7 +62,9 @@ def test_figures_of_a_finished_job(catalog: Catalog, play, sent, tidy) -> None:
 def test_what_came_from_the_cache_is_not_counted_as_work(catalog: Catalog, play, sent, tidy) -> None:
     play.submit(scenes=1)
     play.run(lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(0.01, scans=4, points=100, cached=True)))
-    assert ("l3ps_scans_total", (("stage", "segment"),)) not in scrape(catalog, tidy.queue)
+    found = scrape(catalog, tidy.queue)
+    assert ("l3ps_scans_total", (("project", "prj_default"), ("stage", "segment"))) not in found
+    assert found["l3ps_cached_total", (("stage", "segment"),)] == 1
 
 
 def test_queue_depth_and_age(catalog: Catalog, play, sent, tidy) -> None:
@@ -79,8 +92,152 @@ def test_a_source_that_is_away_costs_only_its_own_series(catalog: Catalog, play,
     gone = Queue(Settings(redis_url="redis://127.0.0.1:1/0"))
     found = scrape(catalog, gone)
     assert found["l3ps_source_up", (("source", "queue"),)] == 0
-    assert found["l3ps_jobs", (("state", "queued"),)] == 1
+    assert found["l3ps_jobs", (("project", "prj_default"), ("state", "queued"))] == 1
     away = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none")
     found = scrape(away, tidy.queue)
     assert found["l3ps_source_up", (("source", "catalog"),)] == 0
     assert found["l3ps_queue_depth", (("queue", "refine"),)] == 0
+
+
+RETRY = workflow.Retry(3, 0.0)
+SEGMENT = ("stage", "segment")
+
+
+def attempts(catalog: Catalog) -> list[tuple[int, str, str | None]]:
+    with catalog.reading() as session:
+        query = select(AttemptRow).where(AttemptRow.name == "segment").order_by(AttemptRow.id)
+        return [(row.attempt, row.outcome, row.cause) for row in session.scalars(query)]
+
+
+def test_every_attempt_is_remembered_and_counted_with_its_cause(catalog: Catalog, play, sent, tidy, cost) -> None:
+    """One that ran out of disk, one whose worker was stopped, one whose worker was killed, and one that was done."""
+    job = play.submit(scenes=1)
+    error = {"message": "no space left", "problems": [], "cause": "disk-full"}
+    play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=RETRY, cost=cost))
+    tidy()
+    play.run(workflow.release)
+    claim = play.take(lease=-1.0)
+    tidy(retry_seconds=0.0)
+    tidy()
+    play.run(lambda tx, claim: workflow.complete(tx, claim, cost))
+    assert claim.attempt == 2
+    ends = attempts(catalog)
+    assert [(attempt, outcome) for attempt, outcome, _ in ends] == [
+        (1, "retried"),
+        (2, "released"),
+        (2, "lost"),
+        (3, "done"),
+    ]
+    assert ends[0][2] == "disk-full" and ends[2][2] is not None and ends[1][2] is ends[3][2] is None
+    with catalog.reading() as session:
+        row = session.scalars(select(AttemptRow).where(AttemptRow.outcome == "lost")).one()
+    assert (row.job_id, row.owner, row.project_id) == (job, "worker-1", "prj_default")
+    found = scrape(catalog, tidy.queue)
+    assert found["l3ps_retries_total", (SEGMENT,)] == 2
+    assert found["l3ps_failures_total", (("cause", "disk-full"), SEGMENT)] == 1
+    assert found["l3ps_attempts_total", (("outcome", "released"), SEGMENT)] == 1
+    assert found["l3ps_attempts_total", (("outcome", "failed"), SEGMENT)] == 0
+    assert found["l3ps_wasted_cpu_seconds_total", (SEGMENT,)] == cost.cpu_seconds
+
+
+def test_a_stage_taken_over_leaves_its_first_attempt_as_lost(catalog: Catalog, play, sent) -> None:
+    play.submit(scenes=1)
+    message = sent.pop(0)
+    play.take(message, owner="gone", lease=-1.0)
+    play.take(message, owner="next")
+    assert attempts(catalog) == [(1, "lost", "lease-lost")]
+
+
+def test_what_is_cancelled_is_no_failure(catalog: Catalog, play, sent, cost) -> None:
+    job = play.submit(scenes=1)
+    claim = play.take()
+    with catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    with catalog.transaction() as tx:
+        workflow.fail(tx, claim, {"message": "torn down", "problems": []}, retry=RETRY, cost=cost)
+    assert attempts(catalog) == [(1, "cancelled", None)]
+
+
+def test_counters_never_go_down_and_the_past_is_read_once(catalog: Catalog, play, sent, tidy, cost) -> None:
+    """What is remembered is not read again; what a slow transaction commits late is counted all the same."""
+    collector = CatalogCollector(catalog, tidy.queue)
+    points = ("l3ps_points_total", (("project", "prj_default"), ("stage", "refine")))
+
+    def finish() -> None:
+        play.submit(scenes=1)
+        while sent:
+            play.run(lambda tx, claim: workflow.complete(tx, claim, cost))
+
+    def age(ids: list[int], by: timedelta) -> None:
+        with catalog.transaction() as tx:
+            for id in ids:
+                row = tx.session.get_one(AttemptRow, id)
+                row.finished_at -= by
+
+    def all_ids() -> list[int]:
+        with catalog.reading() as session:
+            return list(session.scalars(select(AttemptRow.id)))
+
+    finish()
+    first = all_ids()
+    age(first, 2 * LATE)
+    assert scraped(collector)[points] == 10
+    finish()
+    late = [id for id in all_ids() if id not in first]
+    age(late, LATE / 2)
+    assert scraped(collector)[points] == 20
+    with catalog.transaction() as tx:  # nothing of the service does this: it shows that the past is not summed again
+        tx.session.execute(update(AttemptRow).where(AttemptRow.id.in_(first)).values(points=0))
+    assert scraped(collector)[points] == 20
+    assert scrape(catalog, tidy.queue)[points] == 10, "and a new process does sum it"
+
+
+def test_the_quality_of_a_model_is_that_of_its_latest_job(catalog: Catalog, play, sent, tidy, cost) -> None:
+    drive, model = play.drive(scenes=1), play.model()
+
+    def side(pq: float) -> dict:
+        of_class = {"pq": pq, "sq": 80.0, "rq": 50.0, "iou": 60.0, "counted": True}
+        absent = {"pq": None, "sq": None, "rq": None, "iou": 0.0, "counted": False}
+        return {"pq": pq, "sq": 80.0, "rq": 50.0, "miou": 60.0, "classes": {"car": of_class, "bus": absent}}
+
+    for primal, refined in ((30.0, 50.0), (31.0, 29.0)):
+        with catalog.transaction() as tx:
+            workflow.submit_job(tx, drive_id=drive, model=model)
+        while sent:
+            quality = {"protocol": "nuscenes", "primal": side(primal), "refined": side(refined)}
+            told = {"quality": quality, "estimates": {"estimate": 0.6, "support": 0.9, "scans": 2.0}}
+            play.run(lambda tx, claim, told=told: workflow.complete(tx, claim, cost, **told))
+    found = scrape(catalog, tidy.queue)
+    with catalog.reading() as session:
+        name = bundles.get(session, model).name
+    of_model = {"project": "prj_default", "model": name, "protocol": "nuscenes"}
+
+    def value(metric: str, **labels: str) -> float | None:
+        return found.get((metric, tuple(sorted((of_model | labels).items()))))
+
+    assert value("l3ps_model_pq", labels="refined") == 29.0
+    assert value("l3ps_model_pq", labels="primal") == 31.0
+    assert value("l3ps_class_iou", labels="refined", **{"class": "car"}) == 60.0
+    assert value("l3ps_class_iou", labels="refined", **{"class": "bus"}) is None
+    estimate = (("figure", "estimate"), ("model", name), ("project", "prj_default"))
+    assert found["l3ps_label_estimate", estimate] == 0.6
+
+
+def test_leases_that_ran_out_and_open_uploads_show(catalog: Catalog, play, sent, tidy) -> None:
+    play.submit(scenes=1)
+    play.take(lease=-1.0)
+    found = scrape(catalog, tidy.queue)
+    assert found["l3ps_leases_expired", ()] == 1
+    assert found["l3ps_uploads", (("state", "open"),)] == 0
+    assert found["l3ps_stages", (SEGMENT, ("state", "running"))] == 1
+
+
+def test_others_add_their_own_metrics(catalog: Catalog, tidy) -> None:
+    collector = CatalogCollector(catalog, tidy.queue)
+
+    def stages(session) -> list[GaugeMetricFamily]:
+        count = session.scalar(select(func.count()).select_from(StageRow))
+        return [GaugeMetricFamily("l3ps_webhooks", "How many there are.", value=count)]
+
+    collector.add(stages)
+    assert scraped(collector)["l3ps_webhooks", ()] == 0

@@ -1,6 +1,9 @@
 """What belongs to one project does not exist for another."""
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 from sqlalchemy import func, select, text
@@ -100,4 +103,10 @@ def test_what_was_there_before_projects_belongs_to_the_default_one(empty_url: st
     upgrade(empty_url)
     with catalog.scoped(DEFAULT_PROJECT).reading() as session:
         assert drives.get(session, "drv_1").name == "d"
+    if catalog.engine.dialect.name == "sqlite":
+        copies = list(Path(catalog.engine.url.database).parent.glob("*.before-*"))
+        with closing(sqlite3.connect(copies[0])) as copy:
+            columns = [column[1] for column in copy.execute("PRAGMA table_info(drives)")]
+            assert copy.execute("SELECT id FROM drives").fetchall() == [("drv_1",)]
+        assert "project_id" not in columns, "the copy is the catalog as it was"
     catalog.dispose()

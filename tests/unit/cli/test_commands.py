@@ -6,8 +6,6 @@ import socket
 import pytest
 from typer.testing import CliRunner
 
-from l3ps_cli.client import ServiceProblemError, sentences
-from l3ps_cli.download import DamagedDownloadError, _inside
 from l3ps_cli.main import app
 
 
@@ -52,30 +50,6 @@ def test_a_bundle_without_its_network_is_exit_2(nobody, tmp_path):
     (tmp_path / "model.json").write_text("{}")
     code, said = run("submit", tmp_path, "--model", tmp_path)
     assert (code, "model.onnx" in said) == (2, True)
-
-
-def test_a_problem_document_becomes_sentences():
-    document = {
-        "title": "The log cannot be used",
-        "detail": "The log has three problems, the first: calib.txt: the file is missing. Add it.",
-        "errors": [
-            {"where": "calib.txt", "what": "the file is missing", "remedy": "Add it."},
-            {"where": "velodyne/0.bin", "what": "3 bytes are no point.", "remedy": ""},
-            {"where": "times.txt", "what": "the times go back", "remedy": "Sort them"},
-        ],
-    }
-    assert str(ServiceProblemError(422, document)).splitlines() == [
-        "The log has three problems, the first: calib.txt: the file is missing. Add it.",
-        "  velodyne/0.bin: 3 bytes are no point.",
-        "  times.txt: the times go back. Sort them.",
-    ]
-    assert sentences({}) == ["The service refused the request."]
-
-
-@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../x", ""])
-def test_no_listing_of_a_service_makes_download_write_elsewhere(path):
-    with pytest.raises(DamagedDownloadError):
-        _inside(path)
 
 
 def test_a_running_stacks_note_can_be_read_by_scripts(tmp_path):

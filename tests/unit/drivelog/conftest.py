@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l3ps.drivelog import UnpackLimits, unpack
+from l3ps.errors import DriveLogError
+
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
 FORWARD = [0.5, -0.5, 0.5, -0.5]
 """Rotation camera → ego of a camera that looks ahead: x right, y down, z forward."""
@@ -240,3 +243,33 @@ def semantickitti_log(tmp_path: Path) -> Callable[..., Path]:
 def make_png() -> Callable[..., bytes]:
     """``make_png(width, height)``: a PNG image as bytes."""
     return png
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder with nothing but the archive: whatever else is there after a failure was left behind."""
+
+    class Place:
+        archive = tmp_path / "in" / "upload"
+        target = tmp_path / "out" / "log"
+
+        def unpack(self, content: bytes, limits: UnpackLimits = UnpackLimits(), **options) -> dict[str, bytes]:
+            self.archive.parent.mkdir(exist_ok=True)
+            self.archive.write_bytes(content)
+            root = unpack(self.archive, self.target, limits, **options)
+            assert self.left() == {self.target}
+            return {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+        def refused(self, content: bytes, limits: UnpackLimits = UnpackLimits()) -> tuple[str, str]:
+            with pytest.raises(DriveLogError) as caught:
+                self.unpack(content, limits)
+            assert self.left() == set()
+            assert {p.name for p in tmp_path.iterdir()} <= {"in", "out"}
+            (problem,) = caught.value.problems
+            assert problem.remedy
+            return problem.code, str(problem)
+
+        def left(self) -> set[Path]:
+            return set(self.target.parent.iterdir()) if self.target.parent.exists() else set()
+
+    return Place()

@@ -78,7 +78,7 @@ class TestSigner:
         return dict(parse_qsl(urlsplit(url).query))
 
     def test_a_grant_comes_back(self) -> None:
-        grant = Grant("PUT", "a/b", upload_id="u", part=3)
+        grant = Grant("PUT", "a/b", upload_id="u", part=3, size=7)
         url = self.signer.url(grant, 60, now=1000)
         assert url.startswith("http://api/v1/objects/a/b?")
         assert self.signer.verify("PUT", "a/b", self.query(url), now=1059) == grant
@@ -98,6 +98,9 @@ class TestSigner:
             {"expires": "9999"},
             {"upload": "v"},
             {"part": "4"},
+            {"size": "8"},
+            {"size": None},
+            {"size": "x"},
             {"filename": "x"},
             {"signature": "0" * 64},
             {"signature": "ä"},
@@ -107,7 +110,7 @@ class TestSigner:
         ],
     )
     def test_altered(self, changed: dict[str, str | None]) -> None:
-        query = self.query(self.signer.url(Grant("PUT", "a", upload_id="u", part=3), 60, now=1000)) | changed
+        query = self.query(self.signer.url(Grant("PUT", "a", "u", part=3, size=7), 60, now=1000)) | changed
         with pytest.raises(InvalidSignature):
             self.signer.verify("PUT", "a", {k: v for k, v in query.items() if v is not None}, now=1000)
 

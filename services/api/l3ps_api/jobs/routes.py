@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
+from pydantic import AwareDatetime
 
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
 from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
-from l3ps_platform.catalog import JobState
+from l3ps_platform.catalog import JobState, jobs
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -27,19 +28,35 @@ def list_jobs(
     services: ServicesDep,
     limit: Limit = 50,
     cursor: Annotated[Cursor, id_of("job")] = None,
-    state: Annotated[JobState | None, Query(description="Only jobs in this state.")] = None,
+    state: Annotated[
+        list[JobState] | None, Query(description="Only jobs in this state; may be given several times.")
+    ] = None,
+    drive_id: Annotated[str | None, Query(max_length=40, description="Only jobs on this drive.")] = None,
+    model_id: Annotated[str | None, Query(max_length=40, description="Only jobs with this model.")] = None,
+    created_after: Annotated[
+        AwareDatetime | None,
+        Query(description="Only jobs made then or later, as 2026-01-31T12:00:00Z."),
+    ] = None,
+    created_before: Annotated[AwareDatetime | None, Query(description="Only jobs made earlier.")] = None,
 ) -> JobPage:
-    """Jobs, newest first."""
-    return service.page(services, limit, cursor, state)
+    """Jobs, newest first. All conditions that are given hold."""
+    wanted = jobs.Wanted(state or (), drive_id, model_id, created_after, created_before)
+    return service.page(services, limit, cursor, wanted)
 
 
-@router.get("/{job_id}")
-def get_job(job_id: str, services: ServicesDep) -> Job:
+@router.get("/{job_id}", response_model=Job)
+def get_job(job_id: str, services: ServicesDep) -> Response:
     """A job with the progress and cost of each scene's stages and, at its end, its quality."""
-    return service.get(services, job_id)
+    return Response(service.encoded(services, job_id), media_type="application/json")
 
 
 @router.post("/{job_id}/cancel", status_code=202)
 def cancel_job(job_id: str, services: ServicesDep) -> Job:
     """Ask a job to stop; what runs stops at its next scan. Refused when it has succeeded or failed."""
     return service.cancel(services, job_id)
+
+
+@router.post("/{job_id}/retry", status_code=202)
+def retry_job(job_id: str, services: ServicesDep) -> Job:
+    """Run a failed or cancelled job again: only what is missing. Refused in every other state."""
+    return service.retry(services, job_id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 
 from sqlalchemy.orm import Session
@@ -14,7 +15,7 @@ from l3ps_api.services import Services
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
 from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import Conflict
-from l3ps_platform.workflow import cancel_job, submit_job
+from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -48,10 +49,10 @@ def check_active_jobs(services: Services, session: Session) -> None:
         raise over_quota("jobs", limit, "jobs and trainings under way", "Wait for some to end, or cancel them.")
 
 
-def page(services: Services, limit: int, cursor: str | None, state: JobState | None) -> JobPage:
+def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted) -> JobPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
-        rows = jobs.page(session, limit=limit + 1, before=cursor, state=state)
+        rows = jobs.page(session, wanted, limit=limit + 1, before=cursor)
         shown = rows[:limit]
         of_drive = drives.many(session, [row.drive_id for row in shown])
         of_model = bundles.many(session, [row.model_id for row in shown])
@@ -70,7 +71,14 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
 def get(services: Services, job_id: str) -> Job:
     """One job in full. NotFound."""
     with services.catalog.reading() as session:
-        return _document(session, jobs.get(session, job_id))
+        return _document(session, job_id)
+
+
+def encoded(services: Services, job_id: str) -> bytes:
+    """The same as JSON, made anew only when something has changed. NotFound."""
+    with services.catalog.reading() as session:
+        revision = jobs.revision(session, job_id)
+        return services.documents.get(job_id, revision, lambda: _document(session, job_id).model_dump_json().encode())
 
 
 def cancel(services: Services, job_id: str) -> Job:
@@ -83,18 +91,30 @@ def cancel(services: Services, job_id: str) -> Job:
     return get(services, job_id)
 
 
-def _document(session: Session, job: JobRow) -> Job:
-    planned = stages.of_job(session, job.id)
-    ingest = stages.ingest_of(session, drive_id=job.drive_id)
-    rows = [ingest, *planned] if ingest is not None else planned
+def retry(services: Services, job_id: str) -> Job:
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    with services.catalog.reading() as session:
+        wanted = outputs_to_keep(session, job_id)
+    gone = [key for key in wanted if not services.store.exists(key)]
+    with services.catalog.transaction() as tx:
+        retry_job(tx, job_id, gone)
+        note_result(tx.session, "jobs", job_id)
+    return get(services, job_id)
+
+
+def _document(session: Session, job_id: str) -> Job:
+    job, drive, model = jobs.with_inputs(session, job_id)
+    rows = stages.of_job_and_drive(session, job.id, job.drive_id)
+    planned = [row for row in rows if row.job_id == job.id]
     steps = stages.steps(session, [row.id for row in rows])
-    drive = drives.many(session, [job.drive_id])[job.drive_id]
-    model = bundles.get(session, job.model_id)
     done = sum(1.0 if row.state.final else row.fraction for row in planned)
 
     def shown(chosen: Iterable[StageRow]) -> list[Stage]:
         return [stage_document(row, steps[row.id]) for row in chosen]
 
+    of_scene: dict[str | None, list[StageRow]] = defaultdict(list)
+    for row in planned:
+        of_scene[row.scene_id].append(row)
     scenes = [
         Scene(
             id=scene.id,
@@ -103,7 +123,7 @@ def _document(session: Session, job: JobRow) -> Job:
             scans=scene.scans,
             points=scene.points,
             state=scene.state,
-            stages=shown(row for row in planned if row.scene_id == scene.id),
+            stages=shown(of_scene[scene.id]),
         )
         for scene in jobs.scenes(session, job.id)
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import FileResponse
 
 from l3ps_api.objects import service
 from l3ps_api.services import SystemDep
@@ -19,8 +18,8 @@ async def put_object(key: str, request: Request, services: SystemDep) -> Respons
     return Response(headers={"ETag": f'"{etag}"'})
 
 
-@router.head("/{key:path}", response_class=FileResponse, include_in_schema=False)
-@router.get("/{key:path}", response_class=FileResponse)
-def get_object(key: str, request: Request, services: SystemDep) -> FileResponse:
-    """Send the object that the URL's signature permits; `Range` is honoured."""
+@router.head("/{key:path}", response_class=Response, include_in_schema=False)
+@router.get("/{key:path}", response_class=Response)
+def get_object(key: str, request: Request, services: SystemDep) -> Response:
+    """Send the object that the URL's signature permits; one `Range`, `If-Range` and `If-None-Match` are honoured."""
     return service.send(services, service.grant(services, request.method, key, request.query_params))

@@ -43,3 +43,9 @@ def get_training(training_id: str, services: ServicesDep) -> Training:
 def cancel_training(training_id: str, services: ServicesDep) -> Training:
     """Ask a training to stop, which it does within seconds. Refused when it has succeeded or failed."""
     return service.cancel(services, training_id)
+
+
+@router.post("/trainings/{training_id}/retry", status_code=202)
+def retry_training(training_id: str, services: ServicesDep) -> Training:
+    """Run a failed or cancelled training again, from its last checkpoint. Refused in every other state."""
+    return service.retry(services, training_id)

@@ -21,7 +21,7 @@ from l3ps_platform.catalog import JobState, UploadState, annotation_sets, bundle
 from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import Conflict, NotFound, ObjectMissing
 from l3ps_platform.ids import is_id
-from l3ps_platform.workflow import cancel_training, submit_training
+from l3ps_platform.workflow import cancel_training, retry_training, submit_training
 
 _LOG_TAIL = 4000
 """Bytes of the log that a document carries: some forty lines."""
@@ -95,6 +95,14 @@ def cancel(services: Services, training_id: str) -> Training:
         state = cancel_training(tx, training_id).state
         if state in (JobState.SUCCEEDED, JobState.FAILED):
             raise Conflict(f"training {training_id} has {state} already: there is nothing left to cancel")
+        note_result(tx.session, "trainings", training_id)
+    return get(services, training_id)
+
+
+def retry(services: Services, training_id: str) -> Training:
+    """Run a failed or cancelled training again. NotFound, Conflict for another."""
+    with services.catalog.transaction() as tx:
+        retry_training(tx, training_id)
         note_result(tx.session, "trainings", training_id)
     return get(services, training_id)
 

@@ -19,6 +19,12 @@ def part_count(size: int, settings: Settings) -> int:
     return max(1, -(-size // part_size(size, settings)))
 
 
+def part_length(number: int, size: int, settings: Settings) -> int:
+    """Bytes of one part, numbered from 1, of a file of ``size`` bytes."""
+    each = part_size(size, settings)
+    return min(each, size - (number - 1) * each)
+
+
 def largest_part(settings: Settings) -> int:
     """The largest part any upload may have."""
     return part_size(max(settings.max_upload_bytes, settings.max_model_bytes, settings.max_annotations_bytes), settings)

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
 
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
-from l3ps_api.services import ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep
 from l3ps_api.uploads import service
-from l3ps_api.uploads.schemas import Completion, OpenUpload, Upload, UploadRequest
+from l3ps_api.uploads.schemas import (
+    Completion,
+    OpenUpload,
+    PartsWanted,
+    PartUrls,
+    UploadPage,
+    UploadProgress,
+    UploadRequest,
+)
+from l3ps_platform.catalog import UploadState
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 _FOLDERS = {Drive: "drives", Model: "models", Annotations: "annotations"}
@@ -23,10 +34,27 @@ def open_upload(request: UploadRequest, response: Response, services: ServicesDe
     return upload
 
 
+@router.get("")
+def list_uploads(
+    services: ServicesDep,
+    limit: Limit = 50,
+    cursor: Cursor = None,
+    state: Annotated[UploadState | None, Query(description="Only uploads in this state.")] = None,
+) -> UploadPage:
+    """Uploads, newest first; `state=open` finds those that a client left unfinished."""
+    return service.page(services, limit, cursor, state)
+
+
 @router.get("/{upload_id}")
-def get_upload(upload_id: str, services: ServicesDep) -> Upload:
-    """An upload's state."""
+def get_upload(upload_id: str, services: ServicesDep) -> UploadProgress:
+    """An upload's state and the parts that have arrived, with which a client goes on after an interruption."""
     return service.get(services, upload_id)
+
+
+@router.post("/{upload_id}/parts")
+def presign_parts(upload_id: str, wanted: PartsWanted, services: ServicesDep) -> PartUrls:
+    """Fresh URLs for parts of an open upload."""
+    return service.urls(services, upload_id, wanted.numbers)
 
 
 @router.post("/{upload_id}/complete", status_code=202)

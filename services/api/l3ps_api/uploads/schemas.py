@@ -48,9 +48,41 @@ class Upload(BaseModel):
     expires_at: datetime
 
 
+class UploadPage(BaseModel):
+    items: list[Upload]
+    next: str | None = Field(default=None, description="Cursor of the next page, absent on the last.")
+
+
+class ReceivedPart(BaseModel):
+    number: int
+    size: int = Field(description="Bytes.")
+    etag: str = Field(description="The md5 of its bytes in hex.")
+
+
+class UploadProgress(Upload):
+    """An upload and what of it has arrived: all that is needed to go on with it."""
+
+    part_size: int = Field(description="Bytes of every part but the last.")
+    part_count: int = Field(description="How many parts there are.")
+    received: list[ReceivedPart] = Field(description="The parts that have arrived whole, of an open upload.")
+
+
 class OpenUpload(Upload):
     """A fresh upload with the URLs of its parts."""
 
+    part_size: int = Field(description="Bytes of every part but the last.")
+    parts: list[PartUrl]
+
+
+class PartsWanted(BaseModel):
+    """The parts that URLs are wanted for."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    numbers: list[Annotated[int, Field(ge=1, le=10_000)]] = Field(min_length=1, max_length=10_000)
+
+
+class PartUrls(BaseModel):
     part_size: int = Field(description="Bytes of every part but the last.")
     parts: list[PartUrl]
 
@@ -67,6 +99,11 @@ class Completion(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    parts: list[PartTag] = Field(min_length=1, max_length=10_000)
+    parts: list[PartTag] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=10_000,
+        description="Every part with the ETag its PUT answered, to have both compared; default: those that arrived.",
+    )
     name: Name | None = Field(default=None, description="What to call it; default: the file's name without its suffix.")
     sha256: Sha256 | None = Field(default=None, description="Of the whole file; checked before the log is used.")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,8 +14,19 @@ from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
-from l3ps_api.uploads.parts import part_count, part_size
-from l3ps_api.uploads.schemas import Completion, OpenUpload, PartUrl, Upload, UploadRequest
+from l3ps_api.uploads.arrival import join
+from l3ps_api.uploads.parts import part_count, part_length, part_size
+from l3ps_api.uploads.schemas import (
+    Completion,
+    OpenUpload,
+    PartUrl,
+    PartUrls,
+    ReceivedPart,
+    Upload,
+    UploadPage,
+    UploadProgress,
+    UploadRequest,
+)
 from l3ps_api.uploads.sniff import HEAD_BYTES, archive_kind, describe
 from l3ps_platform.catalog import (
     ModelState,
@@ -28,11 +41,8 @@ from l3ps_platform.catalog import (
 )
 from l3ps_platform.errors import Conflict, NotFound, UploadError
 from l3ps_platform.ids import new_id
-from l3ps_platform.objects import Part, segment
+from l3ps_platform.objects import MAX_SECONDS
 from l3ps_platform.workflow import accept_drive, accept_model
-
-_PRESIGN_SECONDS = 7 * 24 * 3600
-"""S3's limit for the life of a presigned URL."""
 
 _REMEDIES = {
     "drive": "Upload a drive log as .zip, .tar, .tar.gz or .tar.zst.",
@@ -59,8 +69,8 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
         what = f"{request.size} bytes are more than the {limit} bytes that kind {request.kind} may have"
         raise too_large("size", what, f"{smaller}, or raise L3PS_{setting.upper()}.")
     upload_id, count = new_id("upl"), part_count(request.size, settings)
-    key = f"uploads/{upload_id}/{segment(request.filename)}"
-    seconds = min(settings.upload_ttl_seconds, _PRESIGN_SECONDS)
+    key = f"uploads/{upload_id}/archive"  # nothing of the client's: what it calls the file is the row's
+    seconds = min(settings.upload_ttl_seconds, MAX_SECONDS)
     multipart = services.store.create_multipart(key)
     try:
         with services.catalog.transaction() as tx:
@@ -82,33 +92,52 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     except BaseException:
         services.store.abort_multipart(key, multipart)
         raise
-    urls = [
-        PartUrl(
-            number=number,
-            url=services.store.presign_part(key, multipart, number, seconds),
-        )
-        for number in range(1, count + 1)
-    ]
-    size = part_size(request.size, settings)
-    return OpenUpload(**_fields(row), part_size=size, parts=urls)
+    urls = _presigned(services, row, range(1, count + 1))
+    return OpenUpload(**_fields(row), part_size=part_size(row.size, settings), parts=urls)
 
 
 def opened(services: Services, upload_id: str) -> OpenUpload:
     """An upload as its opening answered, with fresh URLs. NotFound."""
     with services.catalog.reading() as session:
         row = uploads.get(session, upload_id)
-    left = max(1, int((row.expires_at - datetime.now(UTC)).total_seconds()))
-    urls = [
-        PartUrl(number=number, url=services.store.presign_part(row.object_key, row.s3_upload_id, number, left))
-        for number in range(1, row.parts + 1)
-    ]
+    urls = _presigned(services, row, range(1, row.parts + 1))
     return OpenUpload(**_fields(row), part_size=part_size(row.size, services.settings), parts=urls)
 
 
-def get(services: Services, upload_id: str) -> Upload:
-    """An upload's state."""
+def page(services: Services, limit: int, cursor: str | None, state: UploadState | None) -> UploadPage:
+    """One page, newest first."""
     with services.catalog.reading() as session:
-        return Upload(**_fields(uploads.get(session, upload_id)))
+        rows = uploads.page(session, limit=limit + 1, before=cursor, state=state)
+    shown = rows[:limit]
+    items = [Upload(**_fields(row)) for row in shown]
+    return UploadPage(items=items, next=shown[-1].id if len(rows) > limit else None)
+
+
+def get(services: Services, upload_id: str) -> UploadProgress:
+    """An upload's state and what of it has arrived. NotFound."""
+    with services.catalog.reading() as session:
+        row = uploads.get(session, upload_id)
+    received: list[ReceivedPart] = []
+    if row.state is UploadState.OPEN:
+        with suppress(UploadError):  # closed in this moment
+            received = [
+                ReceivedPart(number=part.number, size=part.size, etag=part.etag)
+                for part in services.store.list_parts(row.object_key, row.s3_upload_id)
+                if part.size is not None and part.size == part_length(part.number, row.size, services.settings)
+            ]
+    each = part_size(row.size, services.settings)
+    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received)
+
+
+def urls(services: Services, upload_id: str, numbers: Iterable[int]) -> PartUrls:
+    """Fresh URLs for parts of an open upload. NotFound; refuses closed uploads and parts it does not have."""
+    with services.catalog.reading() as session:
+        row = _must_be_open(uploads.get(session, upload_id))
+    wanted = sorted(set(numbers))
+    if wanted[-1] > row.parts:
+        what = f"the upload has the parts 1 to {row.parts}, {wanted[-1]} is none of them"
+        raise invalid("numbers", what, "Ask for parts that `received` of the upload lacks.", code="invalid-parts")
+    return PartUrls(part_size=part_size(row.size, services.settings), parts=_presigned(services, row, wanted))
 
 
 def abort(services: Services, upload_id: str) -> None:
@@ -127,13 +156,9 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         row = uploads.get(session, upload_id)
     if row.state is UploadState.COMPLETE:
         return _result(services, row)
-    if row.state is not UploadState.OPEN:
-        detail = f"Upload {upload_id} is {row.state}. Begin a new one with POST /v1/uploads."
-        raise conflict("upload-closed", "The upload is closed", detail)
-    name = _name(row, completion)
+    name = _name(_must_be_open(row), completion)
     # No row is held while the store joins the parts: that can take seconds, and SQLite has one lock for all writers.
-    _join(services, row, completion)
-    refusal = _look(services, row)
+    refusal = join(services, row, completion) or _look(services, row)
     if refusal is not None:
         _discard(services, row)
         raise refusal
@@ -147,21 +172,6 @@ def complete(services: Services, upload_id: str, completion: Completion) -> Driv
         services.store.delete(row.object_key)
     with services.catalog.reading() as session:
         return _result(services, uploads.get(session, upload_id))
-
-
-def _join(services: Services, row: UploadRow, completion: Completion) -> None:
-    numbers = [part.number for part in completion.parts]
-    if sorted(numbers) != list(range(1, row.parts + 1)):
-        what = f"the upload has the parts 1 to {row.parts}, each once; {len(numbers)} were named"
-        raise invalid("parts", what, "Name every part once, with the ETag its PUT answered.", code="invalid-parts")
-    try:
-        parts = [Part(part.number, part.etag) for part in completion.parts]
-        services.store.complete_multipart(row.object_key, row.s3_upload_id, parts)
-    except UploadError as error:
-        # An earlier try may have joined the parts and then lost its answer or its catalog.
-        if not services.store.exists(row.object_key):
-            remedy = "PUT the parts again and name each with the ETag of its answer."
-            raise invalid("parts", str(error), remedy, code="invalid-parts") from error
 
 
 def _look(services: Services, row: UploadRow) -> ApiProblem | None:
@@ -180,7 +190,27 @@ def _look(services: Services, row: UploadRow) -> ApiProblem | None:
 def _discard(services: Services, row: UploadRow) -> None:
     with services.catalog.transaction() as tx:
         uploads.close(tx, row.id, UploadState.ABORTED)
+    services.store.abort_multipart(row.object_key, row.s3_upload_id)
     services.store.delete(row.object_key)
+
+
+def _must_be_open(row: UploadRow) -> UploadRow:
+    if row.state is not UploadState.OPEN:
+        detail = f"Upload {row.id} is {row.state}. Begin a new one with POST /v1/uploads."
+        raise conflict("upload-closed", "The upload is closed", detail, where="path", remedy="Begin a new upload.")
+    return row
+
+
+def _presigned(services: Services, row: UploadRow, numbers: Iterable[int]) -> list[PartUrl]:
+    """URLs that outlive the upload's remaining time by nothing, each for a body of the part's size alone."""
+    seconds = int((row.expires_at - datetime.now(UTC)).total_seconds())
+    seconds = max(1, min(seconds, services.settings.upload_ttl_seconds, MAX_SECONDS))
+    store, settings = services.store, services.settings
+    sized = [(number, part_length(number, row.size, settings)) for number in numbers]
+    return [
+        PartUrl(number=number, url=store.presign_part(row.object_key, row.s3_upload_id, number, seconds, length))
+        for number, length in sized
+    ]
 
 
 def _name(row: UploadRow, completion: Completion) -> str:
@@ -215,8 +245,10 @@ def _lost_race_or_name(services: Services, row: UploadRow, error: Conflict) -> D
         now = uploads.get(session, row.id)
     if now.state is UploadState.COMPLETE:
         return _result(services, now)
-    if now.state is UploadState.OPEN:
-        _discard(services, row)
+    if now.state is UploadState.ABORTED:  # given up while its parts were joined
+        services.store.delete(row.object_key)
+        _must_be_open(now)
+    _discard(services, row)
     detail = f"{str(error)[:1].upper()}{str(error)[1:]}. Nothing was kept."
     raise conflict("name-taken", "The name is taken", detail, where="name", remedy="Choose another name.") from error
 

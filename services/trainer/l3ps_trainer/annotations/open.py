@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal, Protocol, get_args
 
+from l3ps.drivelog import UnpackLimits, unpack
 from l3ps.drivelog.names import subfolders
-from l3ps.drivelog.unpack import UnpackLimits, unpack
 from l3ps.errors import AnnotationError, Problem
 from l3ps.progress import Progress, silent
 
@@ -109,7 +109,6 @@ def opened_annotations(
     if scratch is not None:
         scratch.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="annotations-", dir=scratch) as folder:
-        root = unpack(
-            path, Path(folder) / path.name, limits or UnpackLimits(), progress=progress
-        )  # its name is what messages show
+        target = Path(folder) / path.name  # its name is what messages show
+        root = unpack(path, target, limits or UnpackLimits(), contents="images", progress=progress)
         yield open_annotations(root, format=format, classes=classes, images=images, progress=progress)

@@ -1,0 +1,74 @@
+"""What a client that opens a stream knows already, and what it is to be told."""
+
+from __future__ import annotations
+
+from fastapi.sse import format_sse_event
+
+from l3ps_api.events.hub import PAGE, Entry, EventHub
+from l3ps_api.events.stream import Feed
+from l3ps_api.jobs import service as job_service
+from l3ps_api.problems import ApiProblem, ErrorItem, invalid
+from l3ps_api.services import Services
+from l3ps_platform.catalog import Catalog, EventKind, events, jobs
+from l3ps_platform.catalog.kinds import select_kinds
+
+
+def of_job(services: Services, job_id: str, last: int | None) -> Feed | None:
+    """The stream of one job, from where the client left off or from a snapshot. NotFound.
+
+    None when the job is over and the client has been told.
+    """
+
+    def read(seq: int) -> list[Entry]:
+        return _read(services.catalog, seq, subject=job_id)
+
+    def wants(entry: Entry) -> bool:
+        return entry.subject_id == job_id
+
+    with services.catalog.reading() as session:
+        over = jobs.get(session, job_id).state.final
+        known = events.last_seq(session)  # after the state: its event is among these
+    if last is not None and last <= known:
+        return None if over and not read(last) else Feed(last, read, wants, job_id)
+    snapshot = job_service.get(services, job_id).model_dump_json()
+    opening = format_sse_event(event="snapshot", data_str=snapshot, id=str(known))
+    return Feed(known, read, wants, job_id, opening, over)
+
+
+def of_project(services: Services, project_id: str, kinds: str | None, subject: str | None, last: int | None) -> Feed:
+    """The stream of all that happens in a project, from where the client left off or from now."""
+    try:
+        chosen = select_kinds(part.strip() for part in kinds.split(",")) if kinds is not None else frozenset(EventKind)
+    except ValueError as error:
+        remedy = f"Separate them by commas: {', '.join(EventKind)}, or groups such as job.*."
+        raise invalid("query kinds", str(error), remedy) from None
+
+    def read(seq: int) -> list[Entry]:
+        return _read(services.catalog, seq, subject=subject, kinds=chosen)
+
+    def wants(entry: Entry) -> bool:
+        return entry.project_id == project_id and entry.kind in chosen and subject in (None, entry.subject_id)
+
+    with services.catalog.reading() as session:
+        known = events.last_seq(session)
+    if last is not None and last <= known:
+        return Feed(last, read, wants)
+    # So that a client that is cut off before the first event knows where to go on.
+    opening = format_sse_event(event="open", data_str=f'{{"seq": {known}}}', id=str(known))
+    return Feed(known, read, wants, opening=opening)
+
+
+def admit(hub: EventHub, limit: int) -> None:
+    """Raise a 503 problem where there are too many streams already."""
+    if hub.listeners >= limit:
+        what, remedy = f"{limit} streams are open already", "Try again later, or ask for the job's state instead."
+        items = [ErrorItem(where="path", what=what, remedy=remedy)]
+        detail = f"Of this process {what}. {remedy}"
+        raise ApiProblem(503, "too-many-streams", "Too many streams", detail, items, headers={"Retry-After": "5"})
+
+
+def _read(
+    catalog: Catalog, seq: int, *, subject: str | None = None, kinds: frozenset[EventKind] | None = None
+) -> list[Entry]:
+    with catalog.reading() as session:
+        return [Entry.of(row) for row in events.after(session, seq, limit=PAGE, subject=subject, kinds=kinds)]

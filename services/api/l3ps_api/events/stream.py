@@ -1,0 +1,111 @@
+"""A stream of server-sent events: what was missed, then what happens, and signs of life in between."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import structlog
+from fastapi.concurrency import run_in_threadpool
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+from starlette.types import Message, Send
+
+from l3ps_api.events.hub import PAGE, Entry, EventHub
+from l3ps_platform.catalog.kinds import JOB_OVER
+from l3ps_platform.errors import PlatformError
+
+log = structlog.get_logger(__name__)
+
+HEARTBEAT_SECONDS = 15.0
+RETRY_MS = 2000
+SEND_SECONDS = 30.0
+"""A client that takes nothing for so long, its buffers and ours full, is hung up on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feed:
+    """What one client is to be told.
+
+    Attributes:
+        cursor: everything up to this number is known to it.
+        read: fetches the events after a number from the log, at most ``PAGE``, only those it wants.
+        wants: whether it wants an event of the ring.
+        job_id: the job whose progress it is shown, and with whose end the stream ends.
+        opening: what it is sent first.
+        over: there is nothing to follow.
+    """
+
+    cursor: int
+    read: Callable[[int], list[Entry]]
+    wants: Callable[[Entry], bool]
+    job_id: str | None = None
+    opening: bytes = b""
+    over: bool = False
+
+
+class EventStream(EventSourceResponse):
+    """The answer: never kept by anyone on the way, and ended when the client does not take it."""
+
+    def __init__(self, content: AsyncIterator[bytes]) -> None:
+        super().__init__(content, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
+
+    async def stream_response(self, send: Send) -> None:
+        """Send all there is, each piece within ``SEND_SECONDS``."""
+
+        async def patiently(message: Message) -> None:
+            async with asyncio.timeout(SEND_SECONDS):
+                await send(message)
+
+        try:
+            await super().stream_response(patiently)
+        except TimeoutError:
+            log.info("hung up on a client that takes nothing")
+
+
+async def told(hub: EventHub, feed: Feed) -> AsyncIterator[bytes]:
+    """The stream's bytes. Ends with the job, when the process stops, or when the log cannot be read."""
+    yield format_sse_event(retry=RETRY_MS) + feed.opening
+    if feed.over:
+        return
+    cursor, shown = feed.cursor, None
+    clock = asyncio.get_running_loop().time
+    last_sent = clock()
+    async with hub.listening(feed.job_id):
+        while not hub.closing:
+            news = hub.news
+            try:
+                found, cursor, more = await _after(hub, feed, cursor)
+            except PlatformError as error:
+                log.info("stream ended, the client will come back", reason=str(error))
+                return
+            pieces = [format_sse_event(event=entry.kind, data_str=entry.text, id=str(entry.seq)) for entry in found]
+            over = feed.job_id is not None and bool(found) and found[-1].kind in JOB_OVER
+            progress = None if feed.job_id is None or over or more else hub.progress(feed.job_id)
+            if progress is not None and progress != shown:
+                # Only the latest: what a slow client did not get to see in between is of no use any more.
+                pieces.append(format_sse_event(event="progress", data_str=progress, id=str(cursor)))
+                shown = progress
+            if not pieces and clock() - last_sent >= HEARTBEAT_SECONDS:
+                pieces.append(KEEPALIVE_COMMENT)
+            for piece in pieces:
+                yield piece
+                last_sent = clock()
+            if more:
+                continue
+            if over:
+                return
+            with suppress(TimeoutError):
+                await asyncio.wait_for(news.wait(), max(0.0, last_sent + HEARTBEAT_SECONDS - clock()))
+
+
+async def _after(hub: EventHub, feed: Feed, cursor: int) -> tuple[list[Entry], int, bool]:
+    """What is new after a number, the number that is known then, and whether there is more at once."""
+    if cursor >= hub.base:
+        return [entry for entry in hub.since(cursor) if feed.wants(entry)], max(cursor, hub.head), False
+    head = hub.head  # before the look: what comes after it is in the ring
+    found = await run_in_threadpool(feed.read, cursor)
+    if len(found) == PAGE:
+        return found, found[-1].seq, True
+    return found, max(cursor, head, found[-1].seq if found else 0), False

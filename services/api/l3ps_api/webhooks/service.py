@@ -1,0 +1,149 @@
+"""Webhooks."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+
+from l3ps_api.problems import conflict, invalid
+from l3ps_api.services import Services
+from l3ps_api.webhooks.schemas import (
+    Delivery,
+    DeliveryPage,
+    NewWebhook,
+    Replayed,
+    Webhook,
+    WebhookChange,
+    WebhookPage,
+    WebhookRequest,
+)
+from l3ps_platform.catalog import DeliveryState, WebhookRow, webhooks
+from l3ps_platform.catalog.requests import note_result
+from l3ps_platform.errors import TargetRefused
+from l3ps_platform.ids import new_id
+from l3ps_platform.webhooks import Guard, new_secret
+from l3ps_platform.workflow import deliveries
+
+MAX_WEBHOOKS = 50
+"""In a project. Whatever happens makes one row each, in the transaction in which it happens."""
+
+
+def create(services: Services, request: WebhookRequest) -> NewWebhook:
+    """A new webhook. 422 when its URL may not be called, 409 when there are too many."""
+    _check(services, request.url)
+    with services.catalog.transaction() as tx:
+        if webhooks.count(tx.session) >= MAX_WEBHOOKS:
+            detail = f"The project has {MAX_WEBHOOKS} webhooks, which is as many as there can be."
+            raise conflict("too-many-webhooks", "Too many webhooks", detail, where="url", remedy="Delete one first.")
+        row = WebhookRow(
+            id=new_id("whk"),
+            url=request.url,
+            events=request.events,
+            description=request.description,
+            secret=new_secret(),
+            enabled=True,
+            created_at=tx.now,
+        )
+        tx.session.add(row)
+        tx.session.flush()
+        return _with_secret(row)
+
+
+def page(services: Services, limit: int, cursor: str | None) -> WebhookPage:
+    """One page, newest first."""
+    with services.catalog.reading() as session:
+        rows = webhooks.page(session, limit=limit + 1, before=cursor)
+    shown = rows[:limit]
+    return WebhookPage(items=[Webhook.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+
+
+def get(services: Services, webhook_id: str) -> Webhook:
+    """One webhook. NotFound."""
+    with services.catalog.reading() as session:
+        return Webhook.of(webhooks.get(session, webhook_id))
+
+
+def change(services: Services, webhook_id: str, request: WebhookChange) -> Webhook:
+    """Change what the request names. NotFound; 422 when the new URL may not be called."""
+    if request.url is not None:
+        _check(services, request.url)
+    with services.catalog.transaction() as tx:
+        row = webhooks.lock(tx.session, webhook_id)
+        for name in ("url", "events", "description"):
+            if (value := getattr(request, name)) is not None:
+                setattr(row, name, value)
+        if request.enabled is True:
+            deliveries.enable(row)
+        elif request.enabled is False:
+            deliveries.disable(tx, row, "on request")
+        return Webhook.of(row)
+
+
+def delete(services: Services, webhook_id: str) -> None:
+    """Forget a webhook and its deliveries. NotFound."""
+    with services.catalog.transaction() as tx:
+        tx.session.delete(webhooks.get(tx.session, webhook_id))
+
+
+def rotate(services: Services, webhook_id: str, overlap_seconds: int) -> NewWebhook:
+    """Give a webhook a new secret; for a while the old one signs too. NotFound."""
+    with services.catalog.transaction() as tx:
+        row = webhooks.lock(tx.session, webhook_id)
+        if overlap_seconds:
+            row.previous_secret, row.previous_until = row.secret, tx.now + timedelta(seconds=overlap_seconds)
+        else:
+            row.previous_secret = row.previous_until = None
+        row.secret = new_secret()
+        note_result(tx.session, "webhooks", webhook_id)
+        return _with_secret(row)
+
+
+def shown_again(services: Services, webhook_id: str) -> NewWebhook:
+    """The answer of a request that was cut off after it had made or rotated a webhook. NotFound."""
+    with services.catalog.reading() as session:
+        return _with_secret(webhooks.get(session, webhook_id))
+
+
+def test(services: Services, webhook_id: str) -> Delivery:
+    """Send a message that says nothing. NotFound, Conflict where the webhook is switched off."""
+    with services.catalog.transaction() as tx:
+        return Delivery.of(deliveries.ping(tx, webhooks.lock(tx.session, webhook_id)))
+
+
+def log(
+    services: Services, webhook_id: str, limit: int, cursor: str | None, state: DeliveryState | None
+) -> DeliveryPage:
+    """One page of a webhook's deliveries, newest first. NotFound."""
+    with services.catalog.reading() as session:
+        webhooks.get(session, webhook_id)
+        rows = webhooks.deliveries(session, webhook_id, limit=limit + 1, before=cursor, state=state)
+    shown = rows[:limit]
+    return DeliveryPage(items=[Delivery.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+
+
+def replay(services: Services, webhook_id: str, delivery_id: str) -> Delivery:
+    """Make one delivery again, under its old message id. NotFound, Conflict while it is being made."""
+    with services.catalog.transaction() as tx:
+        hook = webhooks.lock(tx.session, webhook_id)
+        row = webhooks.delivery(tx.session, webhook_id, delivery_id)
+        if not deliveries.replay(tx, hook, [row]):
+            what, remedy = "The delivery is being made at this moment.", "Wait for its end."
+            raise conflict("in-flight", "In flight", what, where="path", remedy=remedy)
+        return Delivery.of(row)
+
+
+def replay_failed(services: Services, webhook_id: str, since: datetime) -> Replayed:
+    """Make all failed deliveries since a date again. NotFound, Conflict where the webhook is switched off."""
+    with services.catalog.transaction() as tx:
+        hook = webhooks.lock(tx.session, webhook_id)
+        return Replayed(count=deliveries.replay(tx, hook, webhooks.failed_since(tx.session, webhook_id, since)))
+
+
+def _check(services: Services, url: str) -> None:
+    try:
+        Guard(services.settings.webhook_allow, http=services.settings.webhook_http).admit(url)
+    except TargetRefused as refusal:
+        raise invalid("url", refusal.what, refusal.remedy, code="url-refused") from refusal
+
+
+def _with_secret(row: WebhookRow) -> NewWebhook:
+    return NewWebhook.model_validate({**Webhook.fields_of(row), "secret": row.secret})

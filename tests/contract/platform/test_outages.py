@@ -1,0 +1,121 @@
+"""Outages use up no attempt, crashes do, on SQLite and PostgreSQL."""
+
+import threading
+
+from l3ps.errors import Problem
+from l3ps_platform import workflow
+from l3ps_platform.catalog import JobState, StageMessage, StageState
+from l3ps_platform.workflow import Cause, Reconciler, Retry, failure
+
+AWAY = failure("the store is away", Cause.STORE_UNAVAILABLE)
+CRASHED = failure("it was killed", Cause.CRASHED)
+AT_ONCE = Retry(3, 0.0, longest_seconds=0.0)
+
+
+def fail(play, error: dict, retry: Retry = AT_ONCE) -> str:
+    """Fail the stage of the next message; the message of its next attempt is in ``sent`` if there is one."""
+    message = play.sent[0]
+    play.run(lambda tx, claim: workflow.fail(tx, claim, error, retry=retry))
+    return message.stage_id
+
+
+def test_an_outage_uses_up_no_attempt(play, sent, tidy) -> None:
+    job = play.submit(scenes=1)
+    for _ in range(5):
+        stage = fail(play, AWAY)
+        tidy()
+    row = play.stage(stage)
+    assert (row.attempt, row.failures, row.outage_since is not None) == (6, 0, True)
+    for _ in range(2):
+        fail(play, CRASHED)
+        tidy()
+    row = play.stage(stage)
+    assert (row.attempt, row.failures, row.outage_since) == (8, 2, None)
+    assert row.error["cause"] == "crashed"
+    play.finish_all()
+    assert play.job(job).state is JobState.SUCCEEDED
+
+
+def test_after_an_outage_a_stage_has_as_many_attempts_as_ever_and_no_more(play, sent, tidy) -> None:
+    job = play.submit(scenes=1)
+    for error in (CRASHED, AWAY, CRASHED, AWAY, CRASHED):
+        fail(play, error)
+        tidy()
+    assert not sent
+    assert play.job(job).state is JobState.FAILED
+
+
+def test_an_outage_without_end_fails_with_its_cause(play, sent) -> None:
+    job = play.submit(scenes=1)
+    stage = fail(play, AWAY, Retry(3, 0.0, outage_seconds=0.0))
+    assert (play.stage(stage).state, play.stage(stage).error) == (StageState.FAILED, AWAY)
+    assert "the store is away" in play.job(job).error["message"]
+
+
+def test_the_wait_in_an_outage_has_a_bound(play, sent) -> None:
+    play.submit(scenes=1)
+    stage = fail(play, AWAY, Retry(3, seconds=3600.0, longest_seconds=60.0))
+    row = play.stage(stage)
+    assert (row.not_before - row.outage_since).total_seconds() == 60
+
+
+def test_a_lease_that_is_taken_over_counts_as_a_failure(play, sent) -> None:
+    play.submit(scenes=1)
+    message = sent[0]
+    for attempt, taken in ((1, 1), (1, 2), (2, 3)):
+        claim = play.take(StageMessage(message.stage_id, attempt, message.name, message.queue), lease=-1)
+        assert claim.attempt == taken
+    assert play.stage(message.stage_id).failures == 2
+    assert play.stage(message.stage_id).error["cause"] == "lease-lost"
+
+
+def test_leases_that_ran_out_unseen_are_borne_for_a_while(play, sent, tidy) -> None:
+    """Who starts, or comes back to a catalog that was away, cannot know whether their owners could prolong them."""
+    play.submit(scenes=2)
+    held = play.take(lease=-1)
+    message = sent[0]
+    play.run(lambda tx, claim: workflow.fail(tx, claim, CRASHED, retry=Retry(3, 0.0)))
+    settings = tidy.settings.model_copy(update={"reconcile_seconds": 0.01, "lease_seconds": 3600.0})
+    stop = threading.Event()
+    broom = threading.Thread(target=Reconciler(play.catalog, tidy.queue, tidy.store, settings).run, args=(stop,))
+    broom.start()
+    while play.stage(message.stage_id).state is not StageState.QUEUED:  # a round was made
+        pass
+    stop.set()
+    broom.join()
+    assert play.stage(held.stage_id).state is StageState.RUNNING
+    assert tidy().expired == 1
+
+
+def test_a_rejected_upload_s_check_says_that_it_did_its_work(play, sent) -> None:
+    with play.catalog.transaction() as tx:
+        workflow.accept_drive(tx, name="d", filename="d.zip", size=9, object_key="uploads/u/d.zip")
+    problem = Problem("no-log", "d.zip", "it holds no drive log", "Pack another.")
+    message = sent[0]
+    play.run(lambda tx, claim: workflow.drive_checked(tx, claim, workflow.Cost(1.0), usable=False, problems=[problem]))
+    stage = play.stage(message.stage_id)
+    assert (stage.state, stage.error["cause"]) == (StageState.DONE, "bad-input")
+    assert stage.error["message"].startswith("the check is done and the upload is rejected: d.zip: it holds no drive")
+
+
+def test_a_cancel_that_comes_when_the_results_are_out_comes_too_late(play, sent) -> None:
+    job = play.submit(scenes=1)
+    for _ in range(2):
+        play.run(lambda tx, claim: workflow.complete(tx, claim, workflow.Cost(1.0)))
+    claim = play.take()
+    with play.catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    with play.catalog.transaction() as tx:
+        workflow.complete(tx, claim, workflow.Cost(1.0), output_key="jobs/x/manifest.json")
+    assert play.job(job).state is JobState.SUCCEEDED
+
+
+def test_what_was_cancelled_says_so(play, sent) -> None:
+    job = play.submit(scenes=1)
+    claim = play.take()
+    with play.catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    with play.catalog.transaction() as tx:
+        assert workflow.lease_lost(tx, claim.stage_id, Retry(3, 0.0), reason="killed", cause=Cause.CRASHED)
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.error["cause"]) == (StageState.CANCELLED, "cancelled")
