@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import structlog
 from fastapi.concurrency import run_in_threadpool
-from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+from fastapi.responses import StreamingResponse
+from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 from starlette.types import Message, Send
 
 from l3ps_api.events.hub import PAGE, Entry, EventHub
@@ -45,8 +46,14 @@ class Feed:
     over: bool = False
 
 
-class EventStream(EventSourceResponse):
-    """The answer: never kept by anyone on the way, and ended when the client does not take it."""
+class EventStream(StreamingResponse):
+    """The answer: never kept by anyone on the way, and ended when the client does not take it.
+
+    Not FastAPI's class of this purpose, which wants routes that yield: ours says before the stream begins whether there
+    is one.
+    """
+
+    media_type = "text/event-stream"
 
     def __init__(self, content: AsyncIterator[bytes]) -> None:
         super().__init__(content, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})

@@ -48,6 +48,12 @@ def create(services: Services, request: WebhookRequest) -> NewWebhook:
         return _with_secret(row)
 
 
+def shown_again(services: Services, webhook_id: str) -> NewWebhook:
+    """The answer of a request that was cut off after it had made a webhook. NotFound."""
+    with services.catalog.reading() as session:
+        return _with_secret(webhooks.get(session, webhook_id))
+
+
 def page(services: Services, limit: int, cursor: str | None) -> WebhookPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
@@ -95,12 +101,6 @@ def rotate(services: Services, webhook_id: str, overlap_seconds: int) -> NewWebh
         row.secret = new_secret()
         note_result(tx.session, "webhooks", webhook_id)
         return _with_secret(row)
-
-
-def shown_again(services: Services, webhook_id: str) -> NewWebhook:
-    """The answer of a request that was cut off after it had made or rotated a webhook. NotFound."""
-    with services.catalog.reading() as session:
-        return _with_secret(webhooks.get(session, webhook_id))
 
 
 def test(services: Services, webhook_id: str) -> Delivery:
