@@ -12,16 +12,20 @@ from schemathesis import GenerationMode
 
 from l3ps_platform.catalog import (
     AnnotationsRow,
+    DeliveryRow,
+    DeliveryState,
     DriveRow,
     DriveState,
     JobRow,
     JobState,
     ModelRow,
     ModelState,
+    RuleRow,
     StageName,
     StageRow,
     StageState,
     TrainingRow,
+    WebhookRow,
 )
 from l3ps_platform.ids import new_id
 
@@ -55,10 +59,7 @@ def belongings(service, projects) -> dict[str, str]:
     found["key_id"] = ours.get("/v1/keys").json()["items"][0]["id"]
     document = service.http.get("/openapi.json").json()
     wanted = {name for path in document["paths"] for name in re.findall(r"{(\w+)}", path)}
-    for collection in ("webhooks", "rules"):
-        name = next((name for name in wanted if name.removesuffix("_id") in (collection, collection[:-1])), None)
-        if name is not None:
-            found[name] = _some(ours, document, f"/v1/{collection}")
+    assert wanted - {"key", "project_id", "path"} <= found.keys(), "have this fixture make what is new here"
     return found
 
 
@@ -75,29 +76,26 @@ def _rows(service, project: str) -> dict[str, str]:
     stage = StageRow(
         id=new_id("stg"), training_id=training.id, name=StageName.TRAIN, queue="train", state=StageState.DONE
     )  # fmt: skip
+    hook = {"url": "https://example.com/hook", "events": [], "secret": "whsec_x", "enabled": True}
+    webhook = WebhookRow(id=new_id("whk"), created_at=now, **hook)
+    sent = {
+        "kind": "ping",
+        "body": "{}",
+        "state": DeliveryState.DELIVERED,
+        "next_at": now,
+        "log": [],
+        "created_at": now,
+    }
+    delivery = DeliveryRow(id=new_id("msg"), webhook_id=webhook.id, **sent)
+    wanted = JOB_SETTINGS | {"model": "m"}
+    rule = RuleRow(id=new_id("rul"), name="r", bucket="b", prefix="", settings=wanted, created_at=now)
     with service.catalog.scoped(project).transaction() as tx:
-        for row in (drive, model, annotations, job, training, stage):
+        for row in (drive, model, annotations, job, training, stage, webhook, delivery, rule):
             tx.session.add(row)
             tx.session.flush()
     names = {"drive_id": drive, "model": model, "annotations_id": annotations, "job_id": job, "training_id": training}
-    return {name: row.id for name, row in names.items()} | {"model_id": model.id}
-
-
-def _some(client: httpx.Client, document: dict, path: str) -> str:
-    """Makes one of a resource this test does not know, from its schema."""
-    made = []
-
-    @settings(max_examples=50, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
-    @given(schemathesis.openapi.from_dict(document)[path]["POST"].as_strategy())
-    def attempt(case):
-        if not made and isinstance(case.body, dict):
-            body = case.body | {"url": "https://example.com/hook"} if "url" in case.body else case.body
-            answer = client.post(path, json=body)
-            made.extend([answer.json()["id"]] if answer.is_success else [])
-
-    attempt()
-    assert made, f"no way was found to make one of {path}: make it here by hand"
-    return made[0]
+    names |= {"model_id": model, "webhook_id": webhook, "delivery_id": delivery, "rule_id": rule}
+    return {name: row.id for name, row in names.items()}
 
 
 def _documents(client: httpx.Client, belongings: dict[str, str], paths: dict) -> dict[str, tuple]:
@@ -126,25 +124,26 @@ def test_what_one_project_has_does_not_exist_for_another(service, projects, belo
             continue
         with subtests.test(path=path):
             ids = {name: belongings.get(name, "nothing") for name in names}
-            assert names[0] in belongings, f"{names[0]} is new here: have `belongings` make one"
             for method in operations:
                 operation = schema[path][method.upper()]
-                for case in _cases(operation):
-                    answer = theirs.request(method, path.format(**ids), json=case)
-                    assert answer.status_code == 404, f"{method} {path}: {answer.status_code} {answer.text}"
-                    tried += 1
+                statuses = set()
+                for body in _bodies(operation):
+                    statuses.add(theirs.request(method, path.format(**ids), json=body).status_code)
+                # Some bodies of the right form are refused for what is in them before anything is looked up.
+                assert 404 in statuses and statuses <= {404, 422}, f"{method} {path}: {statuses}"
+                tried += 1
     assert tried >= 18
     assert _documents(ours, belongings, document["paths"]) == before, "and nothing was done to it"
 
 
-def _cases(operation) -> list:
+def _bodies(operation) -> list:
     """Bodies that the operation takes; None where it takes none."""
     if "requestBody" not in operation.definition.raw:
         return [None]
-    found = []
+    found = [{}]
 
     @settings(
-        max_examples=3, deadline=None, database=None, derandomize=True, phases=[Phase.generate],
+        max_examples=4, deadline=None, database=None, derandomize=True, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(operation.as_strategy(generation_mode=GenerationMode.POSITIVE))
