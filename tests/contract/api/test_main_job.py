@@ -151,6 +151,9 @@ def test_a_job_can_be_cancelled(service, finished, packed):
     answer = service.http.post(f"/v1/jobs/{job['id']}/cancel")
     assert answer.status_code == 202 and answer.json()["cancel_requested"]
     assert service.wait_for_job(job["id"])["state"] == "cancelled"
+    assert service.http.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202, "it stays so"
+    over = service.http.post(f"/v1/jobs/{finished['id']}/cancel")
+    assert "succeeded already" in service.refused(over, 409, "conflict")["detail"]
     answer = service.http.get(f"/v1/jobs/{job['id']}/labels")
     service.refused(answer, 409, "no-labels")
 
