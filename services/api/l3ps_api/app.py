@@ -36,6 +36,7 @@ from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_api.webhooks import service as webhook_service
 from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
@@ -88,7 +89,10 @@ def create_app(settings: Settings) -> FastAPI:
     # The last added is the first to see a request.
     app.add_middleware(
         Idempotency, services=services, operations=lambda: operations_of(app),
-        remade={"uploads": upload_service.opened, "api_keys": key_service.shown_again},
+        remade={
+            "uploads": upload_service.opened, "api_keys": key_service.shown_again,
+            "webhooks": webhook_service.shown_again,
+        },
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))

@@ -47,6 +47,12 @@ def create(services: Services, request: WebhookRequest) -> NewWebhook:
         return _with_secret(row)
 
 
+def shown_again(services: Services, webhook_id: str) -> NewWebhook:
+    """The answer of a request that was cut off after it had made a webhook. NotFound."""
+    with services.catalog.reading() as session:
+        return _with_secret(webhooks.get(session, webhook_id))
+
+
 def page(services: Services, limit: int, cursor: str | None) -> WebhookPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
