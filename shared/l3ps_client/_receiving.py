@@ -108,7 +108,7 @@ def _once(wire: Wire, source: Source, partial: _Partial, report: Callable[[int],
         whole = _whole_length(answer)
         partial.begin(answer.headers.get("etag", ""))
         with partial.appending() as write:
-            for block in answer.iter_raw(_BLOCK):
+            for block in answer.iter_raw():
                 write(block)
                 report(len(block))
     whole = source.size if whole is None else whole

@@ -58,6 +58,8 @@ def listen(
     """One connection to a stream of events; None for a sign of life. Unreachable when it breaks."""
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"} | ({"Last-Event-ID": after} if after else {})
     with wire.open(stream, presigned=False, headers=headers, params=params, timeout=timeout) as answer:
+        if answer.status_code == 204:  # there is nothing to listen for any more
+            return
         if not answer.headers.get("content-type", "").startswith("text/event-stream"):
             raise Refused(406, {"detail": f"{stream} is no stream of events."})
         yield from events(answer.iter_raw())
@@ -72,7 +74,8 @@ def follow(wire: Wire, stream: str, params: dict[str, Any], after: str | None) -
                 attempt = 0
                 if event is not None:
                     after = event.id or after
-                    yield event
+                    if event.kind != "open":  # it tells where the stream begins, and nothing that has happened
+                        yield event
         except (Unreachable, TooManyRequests) as error:
             attempt += 1
             asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0

@@ -11,6 +11,7 @@ Who has more to tell adds a source: ``collector.add(source)`` with a function fr
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from l3ps_platform.queue import Queue
+    from l3ps_platform.settings import Settings
 
 log = structlog.get_logger(__name__)
 
@@ -119,6 +121,25 @@ class CatalogCollector(Collector):
             *estimates(by_model),
             *(metric for source in self._sources for metric in source(session)),
         ]
+
+
+class DiskCollector(Collector):
+    """How much room is left where the embedded stack keeps everything; elsewhere the API has no disk of its own.
+
+    Args:
+        settings: where that is.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._folder = settings.data_dir if settings.store_url.startswith("file://") else None
+
+    def collect(self) -> Iterator[Metric]:
+        """Nothing where there is no such folder."""
+        if self._folder is None or not self._folder.is_dir():
+            return
+        usage = shutil.disk_usage(self._folder)
+        for name, value in (("free", usage.free), ("size", usage.total)):
+            yield GaugeMetricFamily(f"l3ps_disk_{name}_bytes", f"{name.title()} of the data's disk.", value=value)
 
 
 def _added(

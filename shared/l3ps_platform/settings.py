@@ -21,7 +21,7 @@ GiB = 1024 * MiB
 class S3Location(BaseModel):
     """An S3 bucket as named by ``s3://KEY:SECRET@host:port/bucket?secure=0&region=…``."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, hide_input_in_errors=True)
 
     endpoint: str
     bucket: str
@@ -56,12 +56,15 @@ class Settings(BaseSettings):
     A field's comment gives the measurement or the rule behind its default.
     """
 
-    model_config = SettingsConfigDict(env_prefix="L3PS_", extra="ignore")
+    # Values of settings hold secrets, so errors do not repeat them.
+    model_config = SettingsConfigDict(env_prefix="L3PS_", extra="ignore", hide_input_in_errors=True)
 
     data_dir: Path = Field(default_factory=lambda: Path.home() / ".local" / "share" / "l3ps")
-    database_url: str = ""  # empty: SQLite in data_dir
-    redis_url: str = "redis://127.0.0.1:6379/0"  # or unix:///path/redis.sock
-    objects_url: str = ""  # file:///DIR or s3://KEY:SECRET@host:port/bucket?secure=0; empty: data_dir/objects
+    # These three may hold a password: they are left out of the settings' repr, and their values out of errors.
+    database_url: str = Field(default="", repr=False)  # empty: SQLite in data_dir
+    redis_url: str = Field(default="redis://127.0.0.1:6379/0", repr=False)  # or unix:///path/redis.sock
+    # file:///DIR or s3://KEY:SECRET@host:port/bucket?secure=0; empty: data_dir/objects
+    objects_url: str = Field(default="", repr=False)
     # Where clients reach the S3 server, if not where the services reach it (inside compose: minio:9000, outside:
     # localhost:9000). A signature covers the host name, so it cannot be rewritten later. scheme://host:port
     objects_public_url: str | None = None
@@ -90,6 +93,9 @@ class Settings(BaseSettings):
     # takes seconds; one that takes longer and still lives cannot commit once another has taken over.
     idempotency_lease_seconds: float = Field(default=60.0, gt=0)
 
+    # Buckets that jobs may read from and never write to: a JSON list, or separated by commas, of
+    # s3://KEY:SECRET@host:port/bucket/prefix?secure=0&project=prj_… (l3ps_platform.objects.sources).
+    sources: SecretStr = SecretStr("")
     scratch_dir: Path | None = None  # unpacked drives and models of a worker; None: data_dir/scratch
     # Unpacked drives kept between stages. A scene's two stages and a drive's scenes read the same log; the largest
     # recordings met here unpack to well under 1 GB per 40 keyframes with six cameras.
@@ -125,6 +131,10 @@ class Settings(BaseSettings):
     resend_seconds: float = 30.0
     # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
     cancel_seconds: float = 10.0
+    # How long what nothing refers to stays in the store: half-made objects of dead processes, checkpoints of trainings
+    # that failed. Long enough to look into a failure, and to go on with a training.
+    orphan_seconds: float = 24 * 3600.0
+    orphans_every_seconds: float = 3600.0  # how often the whole store is looked through for them
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis

@@ -10,9 +10,10 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, ProcessCollector
 
 from l3ps_api import errors
+from l3ps_api.access_log import AccessLog
 from l3ps_api.annotation_sets.routes import router as annotation_sets
 from l3ps_api.auth import Gate, authenticate
 from l3ps_api.description import describe
@@ -28,9 +29,12 @@ from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
 from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
 from l3ps_api.models.routes import router as models
+from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.projects.routes import router as projects
+from l3ps_api.retention.routes import router as retention
+from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
@@ -41,8 +45,8 @@ from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
-from l3ps_platform.metrics import CatalogCollector
-from l3ps_platform.objects import open_store
+from l3ps_platform.metrics import CatalogCollector, DiskCollector
+from l3ps_platform.objects import open_store, parse_sources
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 from l3ps_platform.webhooks import Deliverer
@@ -55,7 +59,7 @@ Drive logs in, panoptic labels on every LiDAR point out.
 
 1. `POST /v1/uploads` announces an archive; `PUT` its parts to the URLs answered; `POST …/complete` makes it a drive.
 2. `POST /v1/jobs` labels a drive with a model; `GET /v1/jobs/{id}` shows progress, cost and quality.
-3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs.
+3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs; `…/labels.tar` is all of them in one.
 
 A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
 `GET /v1/trainings/{id}` shows progress, log and report.
@@ -69,6 +73,7 @@ Every error is a problem document (RFC 9457) that names the field at fault and t
 
 def create_app(settings: Settings) -> FastAPI:
     """The API of one service."""
+    parse_sources(settings.sources.get_secret_value())  # a service whose settings cannot be read does not start
     queue = Queue(settings)
     catalog = Catalog(settings.catalog_url, sender=queue.send)
     services = Services(settings, catalog, open_store(settings), queue)
@@ -80,10 +85,13 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.events = EventHub(catalog)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
+    app.state.registry.register(DiskCollector(settings))
+    ProcessCollector(registry=app.state.registry)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    for router in (uploads, drives, jobs, labels, models, annotation_sets, trainings, events, webhooks, keys, projects):
+    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention, rules, notifications)
+    for router in (*resources, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.
@@ -103,6 +111,7 @@ def create_app(settings: Settings) -> FastAPI:
     if not settings.loopback and settings.token is None:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
+    app.add_middleware(AccessLog)
     describe(app)
     return app
 

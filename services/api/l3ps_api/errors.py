@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from l3ps.errors import InputError
 from l3ps_api.operations import operations_of
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, fault, items, too_large, unavailable, unknown
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, fault, invalid, items, too_large, unavailable, unknown
 from l3ps_platform.errors import (
     CatalogUnavailable,
     Conflict,
@@ -129,6 +129,8 @@ def _http_error(request: Request, error: HTTPException) -> ApiProblem:
         headers["Allow"] = allowed = ", ".join(methods)
         what, remedy = f"{request.method} does not work on {path}", f"It takes {allowed}."
         return fault(status, code, status.phrase, "method", what, remedy, headers)
+    if status == HTTPStatus.BAD_REQUEST:  # FastAPI's word for a body that is no UTF-8
+        return invalid("body", "the body is not valid JSON", "Send a JSON object.")
     if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:
         what, _, remedy = str(error.detail).partition(". ")
         return too_large("body", what, remedy)

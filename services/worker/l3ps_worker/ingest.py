@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import structlog
 
-from l3ps.drivelog import Drive, open_drive, unpack, validate, without_bad_scans
+from l3ps.drivelog import Drive, open_drive, validate, without_bad_scans
 from l3ps.errors import InputError, Problem
 from l3ps.progress import Progress, silent
 from l3ps.segment.check import check_bundle
@@ -17,7 +18,8 @@ from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, Json, ModelRow, bundles, drives
 from l3ps_platform.errors import StoreError
 from l3ps_worker.context import Context
-from l3ps_worker.work import Done, check_sha256, download, unpack_limits
+from l3ps_worker.fetching import Fetched, check_sha256, download, fetch
+from l3ps_worker.work import Done
 
 log = structlog.get_logger(__name__)
 
@@ -33,35 +35,41 @@ def ingest(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
 
 def _ingest_drive(context: Context, row: DriveRow, progress: Progress) -> Done:
     with context.scratch.workdir() as folder:
-        archive = folder / "archive"
-        sha256 = download(context, row.object_key, archive, row.size, progress)
-        key = f"drive-{sha256}"
-
-        def make(target: Path) -> None:
-            unpack(archive, target, unpack_limits(context.settings), name=row.filename, progress=progress)
-
+        fetched: Fetched | None = None
         problems: Sequence[Problem] = ()
         try:
-            check_sha256(row.sha256, sha256, row.filename)
-            with context.scratch.entry(key, make) as root:
+            fetched = fetch(context, row, folder, progress)
+            check_sha256(row.sha256, fetched.sha256, row.filename)
+            make = partial(fetched.unpack_to, context=context, name=row.filename, progress=progress)
+            with context.scratch.entry(f"drive-{fetched.sha256}", make) as root:
                 drive = open_drive(root)
                 problems = validate(drive, progress)
                 good = without_bad_scans(drive, problems)
                 info, scans, points = _describe(good, progress)
         except InputError as error:
             problems = [_renamed(problem, row.filename) for problem in problems or error.problems]
-            context.scratch.drop(key)
+            digest, size = (fetched.sha256, fetched.size) if fetched is not None else (None, None)
+            if digest is not None:
+                context.scratch.drop(f"drive-{digest}")
             log.info("drive rejected", problems=[str(problem) for problem in problems[:10]])
             return Done(
                 lambda tx, claim, cost: workflow.drive_checked(
-                    tx, claim, cost, usable=False, problems=problems, sha256=sha256
+                    tx, claim, cost, usable=False, problems=problems, sha256=digest, size=size
                 ),
                 afterwards=lambda: _delete(context, row.object_key),
             )
     log.info("drive ready", scans=scans, points=points, problems=len(problems))
     return Done(
         lambda tx, claim, cost: workflow.drive_checked(
-            tx, claim, cost, usable=True, problems=problems, sha256=sha256, format=good.format, info=info
+            tx,
+            claim,
+            cost,
+            usable=True,
+            problems=problems,
+            sha256=fetched.sha256,
+            size=fetched.size,
+            format=good.format,
+            info=info,
         ),
         scans=scans,
         points=points,

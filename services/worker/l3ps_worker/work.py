@@ -1,4 +1,4 @@
-"""What the stages share: the rows they work on, fetching inputs, and what they return."""
+"""What the stages share: the rows they work on, their inputs, and what they return."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from l3ps.drivelog import Drive, Scene, UnpackLimits, open_drive, unpack, validate, without_bad_scans
-from l3ps.errors import InputError, Problem, ProcessingError
+from l3ps.drivelog import Drive, Scene, open_drive, validate, without_bad_scans
+from l3ps.errors import ProcessingError
 from l3ps.presets import PRESETS, Preset
 from l3ps.progress import Progress
 from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
-from l3ps_platform.errors import ObjectMissing
-from l3ps_platform.settings import Settings
 from l3ps_worker.context import Context
-
-_CHUNK = 1 << 20
+from l3ps_worker.fetching import as_checked, download, fetch_again
 
 Finish = Callable[[Transaction, workflow.Claim, workflow.Cost], None]
 
@@ -110,9 +107,7 @@ def unpacked(context: Context, drive: DriveRow, progress: Progress) -> Iterator[
 
     def make(target: Path) -> None:
         with context.scratch.workdir() as folder:
-            archive = folder / "archive"
-            download(context, drive.object_key, archive, drive.size, progress)
-            unpack(archive, target, unpack_limits(context.settings), name=drive.filename, progress=progress)
+            fetch_again(context, drive, target, folder, progress)
 
     with context.scratch.entry(f"drive-{drive.sha256}", make) as root:
         yield root
@@ -124,48 +119,13 @@ def model_file(context: Context, model: ModelRow, progress: Progress) -> Iterato
     assert model.sha256 is not None
 
     def make(target: Path) -> None:
-        download(context, model.object_key, target, model.size, progress)
+        as_checked(download(context, model.object_key, target, model.size, progress), model.sha256)
 
     with context.scratch.entry(f"model-{model.sha256}", make) as path:
         yield path
-
-
-def download(context: Context, key: str | None, path: Path, size: int, progress: Progress) -> str:
-    """Fetch an object into a file and return its sha256; the progress step is ``fetch``, in bytes."""
-    if key is None:
-        raise ProcessingError("the uploaded archive is no longer in the store: upload it again")
-    digest = hashlib.sha256()
-    done = 0
-    try:
-        with context.store.open(key) as source, path.open("wb") as file:
-            while chunk := source.read(_CHUNK):
-                file.write(chunk)
-                digest.update(chunk)
-                done += len(chunk)
-                progress("fetch", done, max(size, done))
-    except ObjectMissing:
-        raise ProcessingError("the uploaded archive is no longer in the store: upload it again") from None
-    return digest.hexdigest()
-
-
-def check_sha256(claimed: str | None, found: str, filename: str) -> None:
-    """InputError for an upload that is not what its client announced."""
-    if claimed is not None and claimed != found:
-        what = f"its sha256 is {found[:12]}…, the client announced {claimed[:12]}…"
-        raise InputError(Problem("damaged-upload", filename, what, "Upload it again."))
 
 
 def sha256_of(path: Path) -> str:
     """Hex sha256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def unpack_limits(settings: Settings) -> UnpackLimits:
-    """The unpacker's limits from the settings."""
-    return UnpackLimits(
-        max_files=settings.unpack_max_files,
-        max_file_bytes=settings.unpack_max_file_bytes,
-        max_total_bytes=settings.unpack_max_total_bytes,
-        max_ratio=settings.unpack_max_ratio,
-    )

@@ -1,23 +1,27 @@
 """The catalog: what there is and what is being done with it.
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
-``bundles`` (models), ``annotation_sets``, ``jobs``, ``trainings``, ``stages``, ``figures`` (sums for the metrics),
-``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction
-writes through ``outbox``), ``webhooks``. What changes states is in
-:mod:`l3ps_platform.workflow`.
+``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
+``outputs``, ``retention``, ``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``,
+``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through
+``outbox``), ``webhooks``. What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import (
     annotation_sets,
+    belongings,
     bundles,
     drives,
     events,
     figures,
     jobs,
     keys,
+    outputs,
     projects,
     quotas,
     requests,
+    retention,
+    rules,
     stages,
     trainings,
     uploads,
@@ -41,13 +45,16 @@ from l3ps_platform.catalog.models import (
     TrainingRow,
     UploadRow,
 )
+from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, RetentionRow
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
+from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
     QUEUE_OF,
     DeliveryState,
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -59,6 +66,7 @@ __all__ = [
     "QUEUE_OF",
     "AnnotationsRow",
     "ApiKeyRow",
+    "ArrivalRow",
     "AttemptRow",
     "Base",
     "Catalog",
@@ -75,10 +83,15 @@ __all__ = [
     "ModelRow",
     "ModelState",
     "Outcome",
+    "OutputRow",
+    "OutputState",
+    "OutputUseRow",
     "Owned",
     "ProjectRow",
     "QueueName",
     "RequestRow",
+    "RetentionRow",
+    "RuleRow",
     "SceneRow",
     "Sender",
     "StageMessage",
@@ -92,15 +105,19 @@ __all__ = [
     "UploadState",
     "WebhookRow",
     "annotation_sets",
+    "belongings",
     "bundles",
     "drives",
     "events",
     "figures",
     "jobs",
     "keys",
+    "outputs",
     "projects",
     "quotas",
     "requests",
+    "retention",
+    "rules",
     "stages",
     "trainings",
     "uploads",

@@ -16,7 +16,14 @@ from l3ps_platform.ids import new_id
 
 
 def add(
-    tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
+    tx: Transaction,
+    *,
+    name: str,
+    filename: str,
+    size: int,
+    object_key: str | None = None,
+    source: str | None = None,
+    sha256: str | None = None,
 ) -> DriveRow:
     """A new drive in state ``uploaded``; :func:`l3ps_platform.workflow.accept_drive` also has it checked."""
     row = DriveRow(
@@ -27,6 +34,7 @@ def add(
         size=size,
         state=DriveState.UPLOADED,
         object_key=object_key,
+        source=source,
         created_at=tx.now,
     )
     tx.session.add(row)

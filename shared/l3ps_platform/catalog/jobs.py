@@ -12,8 +12,9 @@ from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, SceneRow, StageRow
+from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageState
-from l3ps_platform.errors import NotFound
+from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import lowest_id
 
 CLOCKS_DIFFER = timedelta(days=1)
@@ -21,12 +22,12 @@ CLOCKS_DIFFER = timedelta(days=1)
 
 
 def get(session: Session, id: str) -> JobRow:
-    """One job. NotFound."""
+    """One job that is not deleted. NotFound."""
     return queries.get(session, JobRow, id)
 
 
 def lock(session: Session, id: str) -> JobRow:
-    """One job, held against concurrent changes until the transaction ends. NotFound."""
+    """One job, deleted or not, held against concurrent changes until the transaction ends. NotFound."""
     return queries.lock(session, JobRow, id)
 
 
@@ -95,7 +96,7 @@ _REVISION = (
     .join(DriveRow, DriveRow.id == JobRow.drive_id)
     .join(ModelRow, ModelRow.id == JobRow.model_id)
     .outerjoin(StageRow, or_(StageRow.job_id == JobRow.id, StageRow.drive_id == JobRow.drive_id))
-    .where(JobRow.id == bindparam("job"))
+    .where(JobRow.id == bindparam("job"), JobRow.deleted_at.is_(None))
     .group_by(JobRow.id, DriveRow.id, ModelRow.id)
 )
 
@@ -112,7 +113,7 @@ _WITH_INPUTS = (
     select(JobRow, DriveRow, ModelRow)
     .join(DriveRow, DriveRow.id == JobRow.drive_id)
     .join(ModelRow, ModelRow.id == JobRow.model_id)
-    .where(JobRow.id == bindparam("job"))
+    .where(JobRow.id == bindparam("job"), JobRow.deleted_at.is_(None))
 )
 
 
@@ -130,3 +131,21 @@ def unplanned(session: Session, *, drive_id: str | None = None, model_id: str | 
     if model_id is not None:
         query = query.where(JobRow.model_id == model_id)
     return list(session.scalars(query.order_by(JobRow.id).with_for_update()))
+
+
+def delete(tx: Transaction, id: str) -> JobRow:
+    """Hide a finished job, whose labels the reconciler then deletes. NotFound, Conflict while it is not over."""
+    row = lock(tx.session, id)
+    if row.deleted_at is not None:
+        raise NotFound("job", id)
+    if not row.state.final:
+        raise Conflict(f"job {id} is {row.state}: cancel it first, then delete it")
+    row.deleted_at = tx.now
+    tx.session.flush()
+    return row
+
+
+def unswept(session: Session, limit: int = 20) -> list[JobRow]:
+    """Deleted jobs whose labels are still in the store."""
+    query = select(JobRow).where(JobRow.deleted_at.is_not(None), JobRow.swept_at.is_(None))
+    return list(session.scalars(query.order_by(JobRow.deleted_at).limit(limit)))

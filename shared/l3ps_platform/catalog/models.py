@@ -46,6 +46,7 @@ class UploadRow(Owned, Base):
     size: Mapped[int]
     sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
     parts: Mapped[int]
+    part_size: Mapped[int]  # of every part but the last; 0 in rows of before this was kept
     state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
     object_key: Mapped[str]
     s3_upload_id: Mapped[str]
@@ -60,7 +61,9 @@ class DriveRow(Owned, Base):
     ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
     ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
     counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
-    archive file's: the client's claim until the ingest stage has compared it.
+    archive file's: the client's claim until the ingest stage has compared it. A drive by reference has a ``source``
+    (``s3://bucket/prefix``) and no object of ours; its ``sha256`` is over its files' names and contents where it is a
+    folder.
     """
 
     __tablename__ = "drives"
@@ -77,6 +80,7 @@ class DriveRow(Owned, Base):
     problem: Mapped[Json | None]
     info: Mapped[Json | None]
     object_key: Mapped[str | None]
+    source: Mapped[str | None]
     created_at: Mapped[datetime]
     deleted_at: Mapped[datetime | None]
 
@@ -96,8 +100,9 @@ class ModelRow(Owned, Base):
     state: Mapped[ModelState] = mapped_column(default=ModelState.UPLOADED)
     problem: Mapped[Json | None]
     info: Mapped[Json | None]
-    object_key: Mapped[str | None]
+    object_key: Mapped[str | None]  # None once the archive is deleted
     created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
 
 
 class AnnotationsRow(Owned, Base):
@@ -136,6 +141,7 @@ class JobRow(Owned, Base):
         Index(None, "project_id", "state", "id"),
         Index(None, "drive_id", "id"),
         Index(None, "model_id", "id"),
+        Index(None, "deleted_at"),
         # Logs with truth are few; the metrics want the latest of their jobs.
         Index("ix_jobs_with_quality", "id", sqlite_where=_JUDGED, postgresql_where=_JUDGED),
     )
@@ -151,6 +157,8 @@ class JobRow(Owned, Base):
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]  # its labels are deleted; the row stays for the figures
+    swept_at: Mapped[datetime | None]  # and when they had left the store
 
 
 class TrainingRow(Owned, Base):

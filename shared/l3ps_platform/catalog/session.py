@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -87,6 +89,42 @@ class Catalog:
         scoped = copy(self)
         scoped._project = project_id
         return scoped
+
+    def whole(self) -> Catalog:
+        """This catalog with every project's rows, for whoever cleans up."""
+        whole = copy(self)
+        whole._project = None
+        return whole
+
+    @contextmanager
+    def alone(self, what: str) -> Iterator[bool]:
+        """Whether nobody else is at this work now, in any process; held until the block ends or the process dies."""
+        if self.engine.dialect.name == "sqlite":
+            with open(f"{self.engine.url.database}.{what}", "w") as file:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    yield False
+                else:
+                    yield True
+            return
+        # A lock of the session, not of a transaction: no snapshot is held open while the work goes on.
+        with self._connected() as connection:
+            key = {"key": zlib.crc32(what.encode())}
+            mine = bool(connection.execute(text("SELECT pg_try_advisory_lock(:key)"), key).scalar_one())
+            try:
+                yield mine
+            finally:
+                if mine:
+                    connection.execute(text("SELECT pg_advisory_unlock(:key)"), key)
+
+    @contextmanager
+    def _connected(self) -> Iterator[Connection]:
+        try:
+            with self.engine.connect() as connection:
+                yield connection.execution_options(isolation_level="AUTOCOMMIT")
+        except (OperationalError, InterfaceError) as error:
+            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:

@@ -6,6 +6,7 @@ from l3ps_platform.objects.interface import ObjectInfo, ObjectStore, Part, Pendi
 from l3ps_platform.objects.keys import attachment, check_key, content_type, segment
 from l3ps_platform.objects.presign import MAX_SECONDS
 from l3ps_platform.objects.signing import OBJECTS_PATH, Grant, Signer
+from l3ps_platform.objects.sources import Reference, Source, SourceStore, find_source, parse_sources
 from l3ps_platform.objects.stores import open_store
 
 __all__ = [
@@ -18,10 +19,15 @@ __all__ = [
     "ObjectStore",
     "Part",
     "Pending",
+    "Reference",
     "Signer",
+    "Source",
+    "SourceStore",
     "attachment",
     "check_key",
     "content_type",
+    "find_source",
     "open_store",
+    "parse_sources",
     "segment",
 ]

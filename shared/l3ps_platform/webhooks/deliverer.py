@@ -37,7 +37,7 @@ LOOK_SECONDS = 0.5
 """How often the catalog is asked what is due."""
 
 RECORD_SECONDS = 10.0
-"""By so much a delivery's lease outlasts its attempt, to write down how it ended; then somebody makes it again."""
+"""A delivery's lease outlasts its attempt by this, to write down how it ended; then somebody else makes it again."""
 
 PRUNE_SECONDS = 3600.0
 

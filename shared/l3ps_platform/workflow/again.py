@@ -36,7 +36,7 @@ def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRo
 
     Raises:
         NotFound: no such job.
-        Conflict: the job has succeeded or is not over, or its drive's archive is gone.
+        Conflict: the job has succeeded or is not over, or its drive was deleted.
         InputError: its drive or model was rejected.
     """
     job = jobs.get(tx.session, job_id)
@@ -45,8 +45,8 @@ def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRo
     job = jobs.lock(tx.session, job_id)
     if job.state not in _AGAIN:
         raise Conflict(f"job {job_id} is {job.state}: only a failed or cancelled job can be run again")
-    if drive.deleted_at is not None or drive.object_key is None:
-        raise Conflict(f"the archive of drive {drive.id} is gone: upload it again and submit a new job")
+    if drive.deleted_at is not None:
+        raise Conflict(f"drive {drive.id} was deleted: upload it again and submit a new job")
     job.state, job.cancel_requested, job.error, job.quality = JobState.QUEUED, False, None, None
     job.started_at = job.finished_at = None
     tx.session.flush()

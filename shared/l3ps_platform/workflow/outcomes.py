@@ -122,6 +122,7 @@ def drive_checked(
     usable: bool,
     problems: Sequence[Problem],
     sha256: str | None = None,
+    size: int | None = None,
     format: str | None = None,
     info: Json | None = None,
 ) -> None:
@@ -131,6 +132,7 @@ def drive_checked(
     drive.state = DriveState.READY if usable else DriveState.REJECTED
     drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
     drive.sha256, drive.format, drive.info = sha256, format, info
+    drive.size = drive.size if size is None else size
     tx.session.flush()
     notices.of_upload(tx, drive)
     _plan_waiting(tx, drive_id=drive.id)

@@ -26,6 +26,14 @@ def accept_drive(
     return row
 
 
+def accept_source(tx: Transaction, *, source: str) -> DriveRow:
+    """Record a log in somebody else's bucket, ``s3://bucket/prefix``, and have it fetched and checked."""
+    name = source.rstrip("/").rpartition("/")[2][:200]
+    row = drives.add(tx, name=name, filename=source, size=0, source=source)
+    enqueue(tx, add_stage(tx, StageName.INGEST, drive_id=row.id))
+    return row
+
+
 def accept_model(
     tx: Transaction, *, name: str, filename: str, size: int, object_key: str, sha256: str | None = None
 ) -> ModelRow:
@@ -67,6 +75,8 @@ def submit_job(
     if drive.deleted_at is not None:
         raise NotFound("drive", drive_id)
     bundle = bundles.lock(tx.session, bundles.by_name(tx.session, model).id)
+    if bundle.deleted_at is not None:
+        raise NotFound("model", model)
     job = JobRow(
         id=new_id("job"),
         drive_id=drive.id,

@@ -40,6 +40,7 @@ TUNING = {
     **{"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"},
     **{"L3PS_WEBHOOK_ALLOW": "127.0.0.1/32", "L3PS_WEBHOOK_HTTP": "1"},
     **{"L3PS_WEBHOOK_RETRY_SECONDS": "0,0.1,0.1", "L3PS_WEBHOOK_TIMEOUT_SECONDS": "2"},
+    "L3PS_LOG_FORMAT": "json",  # test_logs reads them
 }
 
 
@@ -97,6 +98,14 @@ class Service:
             assert time.monotonic() < deadline, document
             time.sleep(0.1)
         return document
+
+    @staticmethod
+    def until(true: Callable[[], bool], seconds: float = 60) -> None:
+        """Wait for something to be true."""
+        deadline = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
 
     def wait_for_drive(self, drive_id: str) -> dict:
         """A drive once it has been checked."""

@@ -1,4 +1,4 @@
-"""One request at a time: what is repeated, how an error becomes an exception, where the service is looked for."""
+"""One request at a time: what is repeated, what an error answer becomes, where the service is looked for."""
 
 import json
 import os

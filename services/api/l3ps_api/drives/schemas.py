@@ -33,8 +33,9 @@ class Drive(BaseModel):
     id: str
     name: str
     filename: str
-    size: int = Field(description="Bytes of the archive.")
+    size: int = Field(description="Bytes of the archive, or of a folder's files; 0 while unknown.")
     sha256: str | None = None
+    source: str | None = Field(default=None, description="`s3://bucket/prefix` of a drive by reference.")
     format: str | None = Field(default=None, description="`nuscenes`, `kitti-raw` or `semantickitti`, once checked.")
     state: DriveState
     problems: list[ErrorItem] = Field(
@@ -54,6 +55,7 @@ class Drive(BaseModel):
             filename=row.filename,
             size=row.size,
             sha256=row.sha256,
+            source=row.source,
             format=row.format,
             state=row.state,
             problems=stored_items(stored.get("problems")),

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from pydantic import AwareDatetime
 
+from l3ps_api.auth import PrincipalDep
 from l3ps_api.jobs import service
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest
 from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
@@ -16,9 +17,9 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 
 @router.post("", status_code=202)
-def create_job(request: JobRequest, response: Response, services: ServicesDep) -> Job:
+def create_job(request: JobRequest, response: Response, services: ServicesDep, principal: PrincipalDep) -> Job:
     """Start a job. On a drive that is still being checked it waits; on a rejected drive it is refused."""
-    job = service.create(services, request)
+    job = service.create(services, principal.project_id, request)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
@@ -60,3 +61,9 @@ def cancel_job(job_id: str, services: ServicesDep) -> Job:
 def retry_job(job_id: str, services: ServicesDep) -> Job:
     """Run a failed or cancelled job again: only what is missing. Refused in every other state."""
     return service.retry(services, job_id)
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: str, services: ServicesDep) -> None:
+    """Delete a finished job and its labels. Refused while it is not over; what other jobs share with it stays."""
+    service.delete(services, job_id)

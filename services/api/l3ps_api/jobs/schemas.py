@@ -16,12 +16,9 @@ LabelFormat = Literal["nuscenes", "semantickitti"]
 Protocol = Literal["nuscenes", "paper", "semantickitti"]
 
 
-class JobRequest(BaseModel):
-    """What to label and how."""
+class JobSettings(BaseModel):
+    """How to label."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    drive_id: str = Field(max_length=40)
     model: str = Field(max_length=200, description="Name or id of a model.")
     preset: Preset = "best"
     segment: Segment = Field(
@@ -34,6 +31,21 @@ class JobRequest(BaseModel):
         default=None, description="Protocol of the quality figures; default: the one that belongs to the log's truth."
     )
     skip_bad_scans: bool = Field(default=False, description="Label the good scans of a log that has bad ones.")
+
+
+class JobRequest(JobSettings):
+    """What to label and how."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    drive_id: str | None = Field(default=None, max_length=40, description="A drive; or else name a `source`.")
+    source: str | None = Field(
+        default=None,
+        max_length=1100,
+        description="`s3://bucket/prefix` of a log in a bucket that the service may read: an archive, or a folder of "
+        "the log's files. It becomes a drive; nothing is copied but to a worker's scratch.",
+        examples=["s3://fleet/2026/11/22/morning"],
+    )
 
 
 class DriveRef(BaseModel):

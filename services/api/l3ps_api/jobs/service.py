@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 
+import structlog
 from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
 from l3ps_api.limits import over_quota
-from l3ps_api.problems import ApiProblem, items
+from l3ps_api.problems import ApiProblem, invalid, items
 from l3ps_api.services import Services
+from l3ps_api.sources import permitted
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
-from l3ps_platform.workflow import cancel_job, outputs_to_keep, retry_job, submit_job
+from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
+
+log = structlog.get_logger(__name__)
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -22,12 +26,18 @@ _STEPS = (
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
 
 
-def create(services: Services, request: JobRequest) -> Job:
-    """A new job. NotFound for its drive or model; 422 with the problems of a rejected one."""
+def create(services: Services, project_id: str, request: JobRequest) -> Job:
+    """A new job. NotFound for its drive or model; 422 with the problems of a rejected one; 403 for a foreign source."""
+    if (request.drive_id is None) == (request.source is None):
+        what = "a job is on one drive or on one source, and neither or both are named"
+        raise invalid("drive_id", what, "Name either drive_id or source.")
+    source = None if request.source is None else permitted(services, project_id, request.source)
+    settings = request.model_dump(exclude={"drive_id", "source"})
     try:
         with services.catalog.transaction() as tx:
             check_active_jobs(services, tx.session)
-            job = submit_job(tx, **request.model_dump())
+            drive_id = request.drive_id or accept_source(tx, source=str(source)).id
+            job = submit_job(tx, drive_id=drive_id, **settings)
     except InputError as error:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
@@ -37,6 +47,7 @@ def create(services: Services, request: JobRequest) -> Job:
         )
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
+    log.info("job accepted", job=job.id, drive=job.drive_id, model=job.model_id)
     return get(services, job.id)
 
 
@@ -94,6 +105,12 @@ def retry(services: Services, job_id: str) -> Job:
     with services.catalog.transaction() as tx:
         retry_job(tx, job_id, gone)
     return get(services, job_id)
+
+
+def delete(services: Services, job_id: str) -> None:
+    """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
+    with services.catalog.transaction() as tx:
+        jobs.delete(tx, job_id)
 
 
 def _document(session: Session, job_id: str) -> Job:

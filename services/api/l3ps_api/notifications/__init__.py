@@ -1,0 +1,1 @@
+"""What buckets tell: /v1/notifications."""
