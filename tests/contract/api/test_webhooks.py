@@ -394,3 +394,16 @@ def test_bad_requests_name_field_and_remedy(service, receiver):
         (error,) = answer.json()["errors"]
         assert error["where"] == where and error["remedy"]
         assert "password" not in answer.text
+
+
+@pytest.mark.once
+def test_characters_that_no_database_keeps_are_refused(service, receiver):
+    for text in ("\0", "\ud800"):
+        body = json.dumps({"url": receiver.url, "description": text})
+        answer = service.http.post("/v1/webhooks", content=body, headers={"content-type": "application/json"})
+        assert answer.status_code == 422, answer.text
+        body = json.dumps({"url": f"{receiver.url}{text}"})
+        answer = service.http.post("/v1/webhooks", content=body, headers={"content-type": "application/json"})
+        assert answer.status_code == 422, answer.text
+    for path in ("/v1/webhooks/%00", "/v1/webhooks/%00/deliveries", "/v1/jobs/%00/events", "/v1/events?subject=%00"):
+        assert service.http.get(path).status_code in (404, 422), path
