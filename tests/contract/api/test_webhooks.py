@@ -324,7 +324,7 @@ def test_a_receiver_that_hangs_holds_nobody_up_and_is_given_up_on(receiver, hook
         release.set()
         slow.close()
         endless.close()
-    assert [attempt["error"] for attempt in row["log"]] == ["no complete answer within 2 s"] * 2 + [None]
+    assert [attempt["error"] for attempt in row["log"]] == ["no complete answer within 3 s"] * 2 + [None]
 
 
 def test_a_rotated_secret_overlaps_with_the_old_one(service, receiver, hooked, ping):
