@@ -11,7 +11,9 @@ from sqlalchemy import event
 from l3ps_api.events import hub as hub_module
 from l3ps_api.events import stream as stream_module
 from l3ps_api.events.hub import Entry, EventHub
+from l3ps_api.events.service import admit
 from l3ps_api.events.stream import EventStream, Feed, told
+from l3ps_api.problems import ApiProblem
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, DriveState, drives, events
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.workflow import notices
@@ -186,6 +188,19 @@ def test_a_stream_ends_when_the_log_cannot_be_read(catalog, tmp_path) -> None:
         await anext(stream)
         assert await anext(stream, None) is None
         assert hub.listeners == 0
+
+    asyncio.run(play())
+
+
+def test_there_is_an_end_to_the_number_of_streams(catalog) -> None:
+    async def play() -> None:
+        hub = EventHub(catalog)
+        async with hub.listening(), hub.listening():
+            admit(hub, 3)
+            with pytest.raises(ApiProblem) as caught:
+                admit(hub, 2)
+        assert (caught.value.status, caught.value.headers["Retry-After"]) == (503, "5")
+        admit(hub, 2)
 
     asyncio.run(play())
 
