@@ -104,7 +104,7 @@ def _field_error(fault: dict[str, Any]) -> ErrorItem:
         return ErrorItem(where="body", what="the body is not valid JSON", remedy="Send a JSON object.")
     name = ".".join(names)
     where = name if place == "body" and name else f"{place} {name}".rstrip()
-    what = str(fault["msg"])
+    what = str(fault["msg"]).removeprefix("Value error, ")
     what = what[:1].lower() + what[1:]
     if kind == "missing":
         return ErrorItem(where=where, what="the field is missing", remedy="Add it.")

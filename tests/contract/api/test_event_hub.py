@@ -1,6 +1,7 @@
 """One look at the catalog for all who listen, in this process: what streams cost, and what slow clients miss."""
 
 import asyncio
+import shutil
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -16,11 +17,18 @@ from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.workflow import notices
 
 
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalog without rows, to be copied."""
+    path = tmp_path_factory.mktemp("fresh") / "catalog.db"
+    upgrade(f"sqlite:///{path}")
+    return path
+
+
 @pytest.fixture
-def catalog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Catalog]:
+def catalog(fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Catalog]:
     monkeypatch.setattr(hub_module, "TICK_SECONDS", 0.01)
-    url = f"sqlite:///{tmp_path / 'catalog.db'}"
-    upgrade(url)
+    url = f"sqlite:///{shutil.copy(fresh, tmp_path)}"
     made = Catalog(url).scoped(DEFAULT_PROJECT)
     yield made
     made.dispose()
@@ -150,6 +158,18 @@ def test_streams_end_when_the_hub_closes(catalog) -> None:
             await asyncio.sleep(0)
         hub.close()
         assert await ending is None
+
+    asyncio.run(play())
+
+
+def test_a_stream_does_not_outlive_its_credentials_for_long(catalog, monkeypatch) -> None:
+    monkeypatch.setattr(stream_module, "LIFE_SECONDS", 0.05)
+    monkeypatch.setattr(stream_module, "HEARTBEAT_SECONDS", 0.02)
+
+    async def play() -> None:
+        hub = EventHub(catalog)
+        assert {piece async for piece in told(hub, feed(catalog))} <= {b"retry: 2000\n\n", b": ping\n\n"}
+        assert hub.listeners == 0
 
     asyncio.run(play())
 
