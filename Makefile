@@ -17,8 +17,8 @@ demo: setup ## label a simulated drive through the service; DRIVE=log MODEL=bund
 test: lint servers ## style, types, import rules and every test
 	$(RUN) pytest
 
-hostile: servers ## every hostile upload on both stacks, a million empty files among them: 20 minutes, 2 GB of disk
-	L3PS_HOSTILE=1 $(RUN) pytest tests/hostile --timeout 3600
+hostile: servers ## every hostile upload on both stacks, a million empty files among them; ONLY=names takes some
+	L3PS_HOSTILE="$(or $(ONLY),.)" $(RUN) pytest tests/hostile --timeout 3600
 
 chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
 	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")

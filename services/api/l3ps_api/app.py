@@ -10,7 +10,7 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector
 
 from l3ps_api import errors
 from l3ps_api.access_log import AccessLog
@@ -40,6 +40,7 @@ from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_api.webhooks import service as webhook_service
 from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
@@ -86,6 +87,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))
     ProcessCollector(registry=app.state.registry)
+    streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
+    streams.set_function(lambda: app.state.events.listeners)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -96,7 +99,10 @@ def create_app(settings: Settings) -> FastAPI:
     # The last added is the first to see a request.
     app.add_middleware(
         Idempotency, services=services, operations=lambda: operations_of(app),
-        remade={"uploads": upload_service.opened, "api_keys": key_service.shown_again},
+        remade={
+            "uploads": upload_service.opened, "api_keys": key_service.shown_again,
+            "webhooks": webhook_service.shown_again,
+        },
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))

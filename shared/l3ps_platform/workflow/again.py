@@ -11,6 +11,7 @@ from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
 from l3ps_platform.workflow.settling import settle_job
 
@@ -54,6 +55,7 @@ def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRo
     job.state, job.cancel_requested, job.error, job.quality = JobState.QUEUED, False, None, None
     job.started_at = job.finished_at = None
     tx.session.flush()
+    notices.of_parent(tx, job)
     planned = stages.of_job(tx.session, job_id)
     if not planned:
         plan_if_ready(tx, job, drive, model)
@@ -88,6 +90,7 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
             raise Conflict(f"the archive of annotations {id} is gone: upload it again and start a new training")
     training.state, training.cancel_requested, training.error = JobState.QUEUED, False, None
     training.started_at = training.finished_at = None
+    notices.of_parent(tx, training)
     stage = stages.of_training(tx.session, training_id)
     _reset(tx, stage)
     enqueue(tx, stage)

@@ -9,28 +9,31 @@ TOKEN = secrets.token_urlsafe(32)
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
 
 
+BURST = 12
+
+
 @pytest.fixture(scope="module")
 def strict(api_process, redis_server) -> str:
-    """An API that lets each key ask five times, and again after minutes."""
-    limits = {"rate_per_second": "0.001", "rate_burst": "5", "failures_per_second": "0.001", "failures_burst": "3"}
-    quotas = {"max_open_uploads": "2", "max_active_jobs": "1"}
-    return api_process(token=TOKEN, redis_url=redis_server.removesuffix("/0") + "/4", **limits, **quotas)
+    """An API that lets each key ask so often, and again after minutes."""
+    limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
+    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1"}
+    redis_url = redis_server.removesuffix("/0") + "/4"
+    return api_process(token=TOKEN, redis_url=redis_url, training="1", **limits, **quotas)
 
 
 @pytest.fixture(scope="module")
 def fresh(strict):
-    """Makes clients with a key of their own: the address' five go to making them."""
-    made = [
-        httpx.post(
-            f"{strict}/v1/keys",
-            json={"name": "x", "scope": "write"},
-            headers={"Authorization": f"Bearer {TOKEN}"},
-        ).json()
-        for _ in range(5)
-    ]
+    """Makes clients, each with a key to a project of its own."""
+    with httpx.Client(base_url=strict, headers={"Authorization": f"Bearer {TOKEN}"}) as operator:
+        secrets_left = []
+        for number in range(BURST // 2):
+            project = operator.post("/v1/projects", json={"name": f"project {number}"}).json()["id"]
+            there = {"L3PS-Project": project}
+            key = operator.post("/v1/keys", json={"name": "x", "scope": "write"}, headers=there).json()
+            secrets_left.append(key["secret"])
 
     def client() -> httpx.Client:
-        return httpx.Client(base_url=strict, headers={"Authorization": f"Bearer {made.pop()['secret']}"})
+        return httpx.Client(base_url=strict, headers={"Authorization": f"Bearer {secrets_left.pop()}"})
 
     return client
 
@@ -45,12 +48,14 @@ def refused(answer: httpx.Response, code: str) -> dict:
 
 def test_the_excess_is_refused_with_the_time_to_wait_and_other_keys_go_on(fresh):
     with fresh() as greedy, fresh() as modest:
-        answers = [greedy.get("/v1/drives") for _ in range(9)]
-        assert [answer.status_code for answer in answers] == [200] * 5 + [429] * 4
+        answers = [greedy.get("/v1/drives") for _ in range(BURST + 4)]
+        assert [answer.status_code for answer in answers] == [200] * BURST + [429] * 4
         refused(answers[-1], "too-many-requests")
         assert int(answers[-1].headers["retry-after"]) > 1
         assert modest.get("/v1/drives").is_success
-        assert all(greedy.get(path).is_success for path in ("/healthz", "/readyz", "/metrics") for _ in range(9))
+        assert all(
+            greedy.get(path).is_success for path in ("/healthz", "/readyz", "/metrics") for _ in range(BURST + 4)
+        )
 
 
 def test_a_project_has_so_many_open_uploads_and_may_go_on_when_one_is_closed(fresh):
@@ -62,6 +67,19 @@ def test_a_project_has_so_many_open_uploads_and_may_go_on_when_one_is_closed(fre
         assert http.delete(uploads[0].headers["location"]).status_code == 204
         again = http.post("/v1/uploads", json=UPLOAD, headers=key)
     assert again.status_code == 201, "a refusal for now is not kept with the key"
+
+
+def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
+    announced = UPLOAD | {"kind": "annotations", "size": 22}
+    with fresh() as http:
+        upload = http.post("/v1/uploads", json=announced).json()
+        etag = httpx.put(upload["parts"][0]["url"], content=b"PK\x05\x06" + bytes(18)).headers["etag"]
+        parts = {"parts": [{"number": 1, "etag": etag}]}
+        annotations = http.post(f"/v1/uploads/{upload['id']}/complete", json=parts).json()["id"]
+        request = {"annotations": annotations, "backbone": "scratch"}
+        assert http.post("/v1/models/train", json=request | {"name": "first"}).status_code == 202
+        second = http.post("/v1/models/train", json=request | {"name": "second"})
+        assert refused(second, "quota-reached")["errors"][0]["where"] == "jobs"
 
 
 def test_wrong_credentials_are_limited_by_address_and_right_ones_that_are_known_are_not(fresh, strict):

@@ -68,7 +68,9 @@ def known(url, document) -> dict[str, str]:
         found = {"upload_id": upload["id"]}
         for path, operations in document["paths"].items():
             collection = path.removeprefix("/v1/")
-            if "get" in operations and "/" not in collection and (answer := http.get(path)).is_success:
+            if "get" not in operations or "/" in collection or _streams(operations["get"]):
+                continue
+            if (answer := http.get(path)).is_success:
                 for item in answer.json().get("items", ())[:1]:
                     if "id" in item:
                         found |= {f"{collection}_id": item["id"], f"{collection.removesuffix('s')}_id": item["id"]}
@@ -84,13 +86,17 @@ def test_whatever_is_sent_is_answered_as_the_document_says(url, document, known,
         for found in schema.get_all_operations():
             operation = found.ok()
             with subtests.test(operation=operation.label):
-                if "text/event-stream" in str(operation.definition.raw["responses"].get("200")):
+                if _streams(operation.definition.raw):
                     continue  # it never ends
                 for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
                     _try_out(url, operation, mode, known, session, seen[operation.label])
     sys.stdout.write(f"{ {label: sorted(statuses) for label, statuses in seen.items()} }\n")
     for label in ("GET /v1/me", "POST /v1/keys", "GET /v1/jobs/{job_id}", "POST /v1/uploads"):
         assert min(seen[label]) < 300, f"{label} never did anything"
+
+
+def _streams(operation: dict) -> bool:
+    return "text/event-stream" in operation["responses"].get("200", {}).get("content", {})
 
 
 def _try_out(url, operation, mode, known, session, seen) -> None:

@@ -53,7 +53,7 @@ def get_job(job_id: str, services: ServicesDep) -> Response:
 
 @router.post("/{job_id}/cancel", status_code=202)
 def cancel_job(job_id: str, services: ServicesDep) -> Job:
-    """Ask a job to stop; what runs stops at its next scan. Refused when the job is over."""
+    """Ask a job to stop; what runs stops at its next scan. Refused when it has succeeded or failed."""
     return service.cancel(services, job_id)
 
 

@@ -15,6 +15,8 @@ from l3ps_api.problems import ApiProblem, invalid, items
 from l3ps_api.services import Services
 from l3ps_api.sources import permitted
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
+from l3ps_platform.catalog.requests import note_result
+from l3ps_platform.errors import Conflict
 from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
 
 log = structlog.get_logger(__name__)
@@ -91,9 +93,12 @@ def encoded(services: Services, job_id: str) -> bytes:
 
 
 def cancel(services: Services, job_id: str) -> Job:
-    """Ask a job to stop. NotFound, Conflict when it is over."""
+    """Ask a job to stop; one that is cancelled stays so. NotFound, Conflict when it came to another end."""
     with services.catalog.transaction() as tx:
-        cancel_job(tx, job_id)
+        state = cancel_job(tx, job_id).state
+        if state in (JobState.SUCCEEDED, JobState.FAILED):
+            raise Conflict(f"job {job_id} has {state} already: there is nothing left to cancel")
+        note_result(tx.session, "jobs", job_id)
     return get(services, job_id)
 
 
@@ -104,6 +109,7 @@ def retry(services: Services, job_id: str) -> Job:
     gone = [key for key in wanted if not services.store.exists(key)]
     with services.catalog.transaction() as tx:
         retry_job(tx, job_id, gone)
+        note_result(tx.session, "jobs", job_id)
     return get(services, job_id)
 
 
