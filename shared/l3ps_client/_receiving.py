@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import time
@@ -15,6 +14,8 @@ from typing import Any
 
 import httpx
 
+from l3ps_client._bulk import BULK
+from l3ps_client._digest import Digest
 from l3ps_client._errors import Damaged, Refused, TooManyRequests, Unreachable
 from l3ps_client._sending import Progress
 from l3ps_client._wire import Wire
@@ -126,10 +127,11 @@ def _once(wire: Wire, source: Source, partial: _Partial, count: Count) -> None:
         count.add(-partial.length)
         partial.drop()
     asked = partial.length
+    bulk = source.size is None or source.size - asked >= BULK
     headers = {"Range": f"bytes={asked}-", "If-Range": partial.etag} if asked else {}
     with (
         _starting_over_past_the_end(partial, count),
-        wire.open(source.url, presigned=source.presigned, params=source.params, headers=headers) as answer,
+        wire.open(source.url, presigned=source.presigned, params=source.params, headers=headers, bulk=bulk) as answer,
     ):
         if asked and not _goes_on(answer, partial):
             count.add(-partial.length)
@@ -187,7 +189,7 @@ class _Partial:
         self._etag_path = target.with_name(target.name + ".part.etag")
         self._source = source
         self.length, self.etag, self.noted = 0, "", False
-        self._digest = hashlib.sha256()
+        self._digest = Digest()
         with suppress(OSError, ValueError, KeyError):
             noted = json.loads(self._etag_path.read_text())
             if noted["sha256"] == source.sha256 and noted["etag"]:
@@ -216,7 +218,7 @@ class _Partial:
                 while view:
                     view = view[file.write(view) :]
                 if self._source.sha256 is not None:
-                    self._digest.update(block)
+                    self._digest.update_beside(block)
                 self.length += len(block)
                 if self._source.size is not None and self.length > self._source.size:
                     raise Damaged(f"{self.path.stem} is larger than announced and was removed. Try again.")
@@ -231,7 +233,7 @@ class _Partial:
         self.path.unlink(missing_ok=True)
         self._etag_path.unlink(missing_ok=True)
         self.length, self.etag, self.noted = 0, "", False
-        self._digest = hashlib.sha256()
+        self._digest = Digest()
 
     def finish(self, target: Path) -> None:
         """Put the whole file where it belongs; Damaged when it is not what was announced."""

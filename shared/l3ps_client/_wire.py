@@ -12,10 +12,12 @@ from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from functools import cache
 from typing import Any
+from urllib.request import getproxies
 from uuid import uuid4
 
 import httpx
 
+from l3ps_client._bulk import BulkTransport
 from l3ps_client._config import Config
 from l3ps_client._errors import KINDS, Document, Refused, TooManyRequests, Unreachable, sentences
 
@@ -68,11 +70,14 @@ class Wire:
         self._api = httpx.Client(base_url=config.url, headers=headers, **common)
         # Presigned URLs carry their own credentials; S3 refuses a request that brings a second kind.
         self._objects = httpx.Client(headers={"Accept-Encoding": "identity"}, **common)
+        self._bulk = None if getproxies() else httpx.Client(transport=BulkTransport(_trusted()), timeout=timeout)
 
     def close(self) -> None:
         """Let go of all connections."""
         self._api.close()
         self._objects.close()
+        if self._bulk is not None:
+            self._bulk.close()
 
     def get(self, path: str, **params: Any) -> Any:
         """GET a JSON document; parameters that are None are left out."""
@@ -123,10 +128,16 @@ class Wire:
     @contextmanager
     def open(
         self, url: str, *, presigned: bool, headers: Mapping[str, str] | None = None,
-        params: Mapping[str, Any] | None = None, timeout: float | None = None,
+        params: Mapping[str, Any] | None = None, timeout: float | None = None, bulk: bool = False,
     ) -> Iterator[httpx.Response]:  # fmt: skip
-        """GET an answer to read piece by piece, once; what goes wrong on the way becomes this package's errors."""
+        """GET an answer to read piece by piece, once; what goes wrong on the way becomes this package's errors.
+
+        ``bulk`` for one of many megabytes.
+        """
         client = self._objects if presigned else self._api
+        if bulk and self._bulk is not None:
+            headers = {**({} if presigned else self._api.headers), "Accept-Encoding": "identity", **(headers or {})}
+            client = self._bulk
         given = {name: value for name, value in (params or {}).items() if value is not None}
         limits = httpx.Timeout(self.timeout, read=timeout or self.timeout)
         try:

@@ -11,9 +11,12 @@ from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, StageRow, T
 from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow
 from l3ps_platform.catalog.session import Transaction, project_of
 from l3ps_platform.catalog.states import ACTIVE, OutputState, StageName
+from l3ps_platform.errors import OutputDoomed
 
 MAIN = {StageName.SEGMENT: "primal.npz", StageName.REFINE: "scene.json", StageName.TRAIN: "bundle.zip"}
 """The object of a stage's output that is written last and deleted first: while it is there, all is there."""
+
+_TRIES = 5
 
 
 def lock(session: Session, key: str) -> OutputRow | None:
@@ -23,8 +26,8 @@ def lock(session: Session, key: str) -> OutputRow | None:
 
 
 def hold(tx: Transaction, key: str, stage: StageName, project_id: str) -> OutputRow:
-    """One output, made if there is none yet, held until the transaction ends."""
-    while True:
+    """One output, made if there is none yet, held until the transaction ends. OutputDoomed where that does not work."""
+    for _ in range(_TRIES):
         row = lock(tx.session, key)
         if row is not None:
             return row
@@ -36,6 +39,7 @@ def hold(tx: Transaction, key: str, stage: StageName, project_id: str) -> Output
             return new
         except IntegrityError:  # somebody else made it in this moment, and may be deleting it already
             continue
+    raise OutputDoomed(f"{key} is made and deleted again faster than it can be held")
 
 
 def use(tx: Transaction, key: str, stage_id: str) -> None:

@@ -15,7 +15,8 @@ import pytest
 from l3ps.drivelog import open_drive
 from l3ps.evaluate import evaluate_drive
 from l3ps.labels import open_labels, read_poses
-from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState
+from l3ps_platform import workflow
+from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs
 from l3ps_platform.errors import CatalogUnavailable, StoreUnavailable
 from l3ps_worker import runner
 
@@ -370,3 +371,23 @@ def test_a_drive_s_log_is_fetched_again_when_the_scratch_lost_it(direct, drive_z
     (direct.settings.scratch / "cache").mkdir()
     direct.submit(drive)
     assert direct.step() == "done"
+
+
+def test_what_a_stage_makes_stays_while_a_job_that_was_not_deleted_uses_it(
+    direct, short_zip: Path, fast_model: Path
+) -> None:
+    drive = direct.upload_drive(short_zip)
+    direct.upload_model(fast_model)
+    first, second = (direct.submit(drive, preset="fast") for _ in range(2))
+    assert set(direct.run()) == {"done"}
+    made = {info.key for info in direct.store.list("stages/")}
+    sweeper = workflow.Sweeper(direct.catalog, direct.store, direct.settings)
+    for job, left in ((first, made), (second, set())):
+        with direct.catalog.transaction() as tx:
+            jobs.delete(tx, job)
+        with direct.catalog.reading() as session:
+            sizes = outputs.stored_bytes(session) - direct.drive(drive).size
+        assert sizes >= sum(direct.store.stat(key).size for key in made if not key.endswith("scene.json"))
+        sweeper.run_once()
+        assert {info.key for info in direct.store.list("stages/")} == left
+    assert list(direct.store.list("jobs/")) == []
