@@ -17,8 +17,8 @@ demo: setup ## label a simulated drive through the service; DRIVE=log MODEL=bund
 test: lint servers ## style, types, import rules and every test
 	$(RUN) pytest
 
-hostile: servers ## every hostile upload on both stacks, a million empty files among them: 20 minutes, 2 GB of disk
-	L3PS_HOSTILE=1 $(RUN) pytest tests/hostile --timeout 3600
+hostile: servers ## every hostile upload on both stacks, a million empty files among them; ONLY=names takes some
+	L3PS_HOSTILE="$(or $(ONLY),.)" $(RUN) pytest tests/hostile --timeout 3600
 
 chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
 	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
@@ -69,6 +69,9 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 
 load: servers ## 200 clients read their job's status for 3 minutes while two workers are busy; writes load-report.json
 	$(RUN) python tests/load/status.py
+
+bench-transfer: servers ## a large file up and down beside the bare minio client; MB=2048 ROUNDS=3; transfer-report.json
+	$(RUN) python tests/load/transfer.py $(if $(MB),--mb $(MB)) $(if $(ROUNDS),--rounds $(ROUNDS))
 
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py

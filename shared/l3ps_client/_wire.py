@@ -212,7 +212,7 @@ def refusal(answer: httpx.Response) -> Exception:
     if status == 429:
         return TooManyRequests(status, document, retry_after(answer))
     if status in _LATER + _NOT_THE_SERVICE:
-        return Unreachable("\n".join(sentences(document)))
+        return Unreachable("\n".join(sentences(document)), retry_after(answer))
     return KINDS.get(status, Refused)(status, document)
 
 

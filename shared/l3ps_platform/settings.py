@@ -163,7 +163,7 @@ class Settings(BaseSettings):
     checkpoint_seconds: float = 30.0  # how often a training's checkpoint and log go to the object store
 
     event_days: float = Field(default=30.0, gt=0)  # the event log and finished deliveries are kept for so long
-    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; one costs about 50 kB
+    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; 200 took 120 kB each
     # Networks that webhooks may reach though they are not public, e.g. 10.1.0.0/16,127.0.0.1/32; else a client could
     # have the service call into its own network.
     webhook_allow: Annotated[tuple[IPv4Network | IPv6Network, ...], NoDecode] = ()

@@ -101,7 +101,8 @@ def test_poison_scene(scenario, ends_well, baseline) -> None:
 
     The job is then run again without the poison.
     """
-    service = scenario(faults=[{"stage": "refine", "fault": "abort", "scene": "scene-0001"}])
+    # The main process notes within six seconds that a child is gone, and how; a shorter lease would say it first.
+    service = scenario(faults=[{"stage": "refine", "fault": "abort", "scene": "scene-0002"}], lease_seconds=10.0)
     service.begin()
     long_drive = service.upload(service.workload.long_drive, "long.zip", "drive")
     case = next(iter(service.jobs.values()))

@@ -187,4 +187,11 @@ def zip_of_empty_files(count: int) -> bytes:
 
 def tar_of_empty_files(count: int) -> bytes:
     """A tar of empty files."""
-    return b"".join(header(f"{number:07d}") for number in range(count)) + END
+    block = bytearray(header("0" * 7))
+    out = io.BytesIO()
+    for number in range(count):  # a header by tarfile takes thirty times as long
+        block[:7] = b"%07d" % number
+        block[148:156] = b" " * 8
+        block[148:156] = b"%06o\0 " % sum(block)
+        out.write(block)
+    return out.getvalue() + END

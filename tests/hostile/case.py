@@ -1,10 +1,16 @@
 """What a hostile upload is, and what must become of it."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from .samples import Samples
+
+ONLY = os.environ.get("L3PS_HOSTILE", "")
+"""In ``make hostile`` a regular expression of names of cases."""
+FULL = bool(ONLY)
+"""Whether this is ``make hostile``: every such case on both stacks, with the limits as they ship."""
 
 
 @dataclass(frozen=True)

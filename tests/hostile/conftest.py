@@ -1,21 +1,19 @@
 """The real service, twice, with an eye on what its workers use and on what is left behind."""
 
-import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import pytest
 from tests.contract.api import conftest as api
 from tests.contract.api.conftest import Service
 
+from .case import FULL
 from .cases_models import small_bundle
 from .samples import Samples, read_folder
-
-FULL = "L3PS_HOSTILE" in os.environ
-"""Whether this is ``make hostile``: every case, with the limits as they ship."""
 
 LIMITS = {} if FULL else {"L3PS_UNPACK_MAX_FILES": "2000"}
 LIMITS |= {"L3PS_RETRY_SECONDS": "0.1"}
@@ -35,7 +33,8 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
 def service(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """The service as ``l3ps up`` runs it, and on PostgreSQL, MinIO and a Redis server; not the one of other tests."""
     data = tmp_path_factory.mktemp("hostile")
-    start = api._embedded if request.param == "embedded" else api._servers
+    embedded, servers = partial(api._embedded, training=False), partial(api._servers, redis_database=2)
+    start = embedded if request.param == "embedded" else servers
     with pytest.MonkeyPatch.context() as patch:
         for name, value in LIMITS.items():
             patch.setenv(name, value)

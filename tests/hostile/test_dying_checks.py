@@ -7,7 +7,7 @@ import time
 from sqlalchemy import select
 from tests.contract.api.conftest import Service
 
-from l3ps_platform.catalog import StageName, StageRow, StageState
+from l3ps_platform.catalog import StageName, StageRow, StageState, UploadRow
 
 from .archives import gz, header, zipped
 
@@ -45,4 +45,6 @@ def test_a_check_that_dies_every_time_ends_as_not_checked(service, samples):
     assert after["state"] == "ready"
     work = service.settings.scratch / "work"
     service.wait("/healthz", lambda _: not list(work.iterdir()))  # swept by the next stage
-    service.wait("/healthz", lambda _: not any("deadly" in key for key in service.objects()))  # by the reconciler
+    with service.catalog.reading() as session:
+        upload = session.scalars(select(UploadRow).where(UploadRow.result_id == drive_id)).one()
+    service.wait("/healthz", lambda _: upload.object_key not in service.objects())  # deleted by the reconciler

@@ -21,7 +21,7 @@ from l3ps_platform.processes import Child
 from l3ps_platform.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
-WORKERS, NICE, READY_SECONDS = 2, 10, 60.0
+WORKERS, READY_SECONDS = 2, 60.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,6 @@ def embedded(data: Path, environment: dict[str, str]) -> Iterator[Running]:
     try:
         with Stack(StackOptions(data, port=0, workers=WORKERS, threads=1, token=token)) as stack:
             children = {child.name: child for child in stack.processes.children}
-            _yield_to_others(children["worker"])
             yield Running(stack.url, token, children["api"])
     finally:
         os.environ.clear()
@@ -82,13 +81,8 @@ def servers(data: Path, environment: dict[str, str]) -> Iterator[Running]:
         api = processes.start("api", [sys.executable, "-m", "l3ps_api"], env)
         processes.wait_until(lambda: _ready(settings.api_url), "the API", READY_SECONDS)
         command = [sys.executable, "-m", *WORKER, "-Q", QUEUES]
-        _yield_to_others(processes.start("worker", command, env, stop_plan=STOP_WORKER))
+        processes.start("worker", command, env, stop_plan=STOP_WORKER)
         yield Running(settings.api_url, token, api)
-
-
-def _yield_to_others(worker: Child) -> None:
-    """What workers do by themselves where they have the setting; its children take it over."""
-    os.setpriority(os.PRIO_PGRP, worker.pid, NICE)
 
 
 def _minio() -> Path:

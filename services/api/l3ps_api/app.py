@@ -10,7 +10,7 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector
 
 from l3ps_api import errors
 from l3ps_api.access_log import AccessLog
@@ -87,6 +87,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))
     ProcessCollector(registry=app.state.registry)
+    streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
+    streams.set_function(lambda: app.state.events.listeners)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act

@@ -177,6 +177,13 @@ def _parted(error: Exception, remedy: str) -> tuple[str, str]:
     return what, f"{given[:1].upper()}{given[1:].rstrip('.')}." if given else remedy
 
 
+def _unkept(_: Request, error: sqlalchemy.exc.DataError) -> ApiProblem:
+    # An id or cursor with a NUL, for one: PostgreSQL refuses to look for it where SQLite finds nothing.
+    log.info("refused by the database", reason=str(error.orig))
+    what = "it holds a character or a number that no row can hold"
+    return invalid("request", what, "Look at its path and query for NUL characters and numbers beyond 64 bits.")
+
+
 _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]], ...] = (
     (ApiProblem, _as_is),
     (RequestValidationError, _invalid_request),
@@ -191,5 +198,6 @@ _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]
     (StoreUnavailable, _down("object store")),
     (QueueUnavailable, _down("queue")),
     (CatalogUnavailable, _down("catalog")),
+    (sqlalchemy.exc.DataError, _unkept),
     (sqlalchemy.exc.TimeoutError, _down("catalog")),  # no free connection
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from sqlalchemy import ColumnElement, bindparam, case, func, or_, select
@@ -63,12 +63,17 @@ def _conditions(wanted: Wanted) -> list[ColumnElement[bool]]:
         found.append(JobRow.model_id == wanted.model_id)
     # Ids sort by time, and pages are in the order of ids: their bounds are what an index can use.
     if wanted.created_after is not None:
-        found.append(JobRow.created_at >= wanted.created_after)
-        found.append(JobRow.id >= lowest_id("job", wanted.created_after - CLOCKS_DIFFER))
+        after = _storable(wanted.created_after)
+        found += [JobRow.created_at >= after, JobRow.id >= lowest_id("job", after - CLOCKS_DIFFER)]
     if wanted.created_before is not None:
-        found.append(JobRow.created_at < wanted.created_before)
-        found.append(JobRow.id < lowest_id("job", wanted.created_before + CLOCKS_DIFFER))
+        before = _storable(wanted.created_before)
+        found += [JobRow.created_at < before, JobRow.id < lowest_id("job", before + CLOCKS_DIFFER)]
     return found
+
+
+def _storable(moment: datetime) -> datetime:
+    """A moment as far off as anyone may name, brought to where calculating with it does not overflow."""
+    return min(max(moment, datetime(1970, 1, 2, tzinfo=UTC)), datetime(9000, 1, 1, tzinfo=UTC))
 
 
 def revision(session: Session, id: str) -> tuple[Any, ...]:
@@ -102,7 +107,7 @@ _REVISION = (
 
 
 def with_inputs(session: Session, id: str) -> tuple[JobRow, DriveRow, ModelRow]:
-    """One job with its drive and model, deleted or not. NotFound."""
+    """One job that is not deleted, with its drive and model, which may be. NotFound."""
     row = session.execute(_WITH_INPUTS, {"job": id}).one_or_none()
     if row is None:
         raise NotFound(JobRow.noun, id)

@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ColumnElement, exists, func, or_, select
 from sqlalchemy.orm import Session
 
-from l3ps_platform.catalog.models import DriveRow, JobRow
+from l3ps_platform.catalog.models import DriveRow, JobRow, ProjectRow
 from l3ps_platform.catalog.output_rows import RetentionRow
 from l3ps_platform.catalog.session import Transaction, project_of
 from l3ps_platform.catalog.states import ACTIVE, DriveState
@@ -65,6 +65,13 @@ def oldest(
     for at, drive in session.execute(drives.order_by(last, DriveRow.id).limit(limit)):
         found.append((at or drive.created_at, drive))
     return sorted(found, key=lambda item: (item[0], item[1].id))[:limit]
+
+
+def of_closed_projects(session: Session, limit: int) -> list[JobRow]:
+    """Jobs of projects that were deleted: nobody can ask for their labels any more."""
+    query = select(JobRow).join(ProjectRow, ProjectRow.id == JobRow.project_id)
+    query = query.where(ProjectRow.deleted_at.is_not(None), JobRow.deleted_at.is_(None))
+    return list(session.scalars(query.limit(limit)))
 
 
 def _active() -> ColumnElement[bool]:

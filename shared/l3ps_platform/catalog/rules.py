@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from sqlalchemy import delete as sql_delete
 from sqlalchemy import func, select
@@ -92,10 +92,10 @@ def note(tx: Transaction, found: Sequence[tuple[RuleRow, str, str, str]]) -> lis
     return [id for id in ids if id in kept]
 
 
-def waiting(session: Session, limit: int = 100) -> list[ArrivalRow]:
-    """Arrivals that are no job yet, the oldest first."""
-    query = select(ArrivalRow).where(ArrivalRow.settled_at.is_(None)).order_by(ArrivalRow.id)
-    return list(session.scalars(query.limit(limit)))
+def waiting(session: Session, limit: int = 100, without: Collection[str] = ()) -> list[ArrivalRow]:
+    """Arrivals that are no job yet, the oldest first; none of the projects ``without``."""
+    query = select(ArrivalRow).where(ArrivalRow.settled_at.is_(None), ArrivalRow.project_id.not_in(without))
+    return list(session.scalars(query.order_by(ArrivalRow.id).limit(limit)))
 
 
 def lock_waiting(session: Session, id: str) -> ArrivalRow | None:

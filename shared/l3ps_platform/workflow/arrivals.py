@@ -7,7 +7,7 @@ import time
 import structlog
 
 from l3ps.errors import InputError
-from l3ps_platform.catalog import rules
+from l3ps_platform.catalog import quotas, rules
 from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.catalog.source_rows import ArrivalRow
 from l3ps_platform.errors import NotFound
@@ -16,40 +16,60 @@ from l3ps_platform.workflow.planning import accept_source, error_json, submit_jo
 log = structlog.get_logger(__name__)
 
 
-def settle_arrivals(catalog: Catalog, seconds: float, limit: int = 1000) -> int:
-    """Make jobs of arrivals that wait for it, for so long at most; how many were settled.
+def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
+    """Make jobs of arrivals that wait for it, the oldest first; how many were settled.
 
     Each in a transaction of its own: whatever happens in between, an arrival is one job or none yet. Several may do
-    this at once.
+    this at once. Those of a project that has as many jobs under way as it may go on waiting.
 
     Args:
         catalog: of one project, or of all.
         seconds: after which the rest is left to the next call.
-        limit: how many at most.
+        max_active: jobs and trainings that a project may have under way.
     """
     end, count = time.monotonic() + seconds, 0
-    with catalog.reading() as session:
-        found = rules.waiting(session, limit)
-    for arrival in found:
-        if time.monotonic() > end:
-            break
-        with catalog.scoped(arrival.project_id).transaction() as tx:
-            row = rules.lock_waiting(tx.session, arrival.id)
-            if row is not None:
-                _settle(tx, row)
-                count += 1
-    return count
+    full: set[str] = set()
+    tried: set[str] = set()
+    while True:
+        with catalog.reading() as session:
+            found = [row for row in rules.waiting(session, without=full) if row.id not in tried]
+        for arrival in found:
+            if time.monotonic() > end:
+                return count
+            tried.add(arrival.id)
+            if arrival.project_id in full:
+                continue
+            own = catalog.scoped(arrival.project_id)
+            with own.reading() as session:
+                if quotas.active_jobs(session) >= max_active:
+                    full.add(arrival.project_id)
+                    continue
+            count += _settle(own, arrival)
+        if not found:
+            return count
 
 
-def _settle(tx: Transaction, arrival: ArrivalRow) -> None:
-    settings = rules.get(tx.session, arrival.rule_id).settings
-    arrival.settled_at = tx.now
+def _settle(catalog: Catalog, arrival: ArrivalRow) -> bool:
+    """Whether it was settled here, and not elsewhere in this moment."""
     try:
-        with tx.session.begin_nested():
-            drive = accept_source(tx, source=arrival.source)
-            arrival.job_id = submit_job(tx, drive_id=drive.id, **settings).id
+        with catalog.transaction() as tx:
+            row = _taken(tx, arrival)
+            if row is not None:
+                settings = rules.get(tx.session, row.rule_id).settings
+                drive = accept_source(tx, source=row.source)
+                row.job_id = submit_job(tx, drive_id=drive.id, **settings).id
+            return row is not None
     except (InputError, NotFound) as error:
-        tx.outbox.clear()
-        arrival.error = error_json(error)
         log.warning("arrival without a job", rule=arrival.rule_id, source=arrival.source, reason=str(error))
-    tx.session.flush()
+        with catalog.transaction() as tx:
+            row = _taken(tx, arrival)
+            if row is not None:
+                row.error = error_json(error)
+            return row is not None
+
+
+def _taken(tx: Transaction, arrival: ArrivalRow) -> ArrivalRow | None:
+    row = rules.lock_waiting(tx.session, arrival.id)
+    if row is not None:
+        row.settled_at = tx.now
+    return row

@@ -20,11 +20,13 @@ log = structlog.get_logger(__name__)
 def expire(catalog: Catalog, limit: int) -> int:
     """Delete the finished jobs and idle drives that are beyond their project's age or size, at most ``limit``.
 
-    The oldest go first; what an unfinished job refers to is no candidate. Returns how many went.
+    The oldest go first; what an unfinished job refers to is no candidate. So go the jobs of deleted projects. Returns
+    how many went.
     """
     with catalog.reading() as session:
         rules = retention.limited(session)
-    count = 0
+        ownerless = retention.of_closed_projects(session, limit)
+    count = sum(_delete(catalog, job, "project deleted") for job in ownerless)
     for rule in rules:
         count += _by_age(catalog, rule, limit - count)
         count += _by_size(catalog, rule, limit - count)

@@ -12,7 +12,7 @@ from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
 import structlog
-from sqlalchemy import select, update
+from sqlalchemy import ColumnElement, select, update
 
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import StageRow
@@ -44,6 +44,7 @@ class Report:
     expired: int = 0
     retried: int = 0
     resent: int = 0
+    spent: int = 0
     uploads: int = 0
     archives: int = 0
     expired_jobs: int = 0
@@ -93,7 +94,8 @@ class Reconciler:
             expired=self._expire_leases(),
             retried=self._release_retries(),
             resent=self._resend(),
-            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds),
+            spent=self._drop_spent(),
+            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs),
             **self._sweeper.run_once(),
         )
 
@@ -144,6 +146,21 @@ class Reconciler:
                     tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
             return len(tx.outbox)
 
+    def _drop_spent(self) -> int:
+        """Forget messages that a killed worker left delivered for ever, once there is nothing left to do for them."""
+        delivered = self._queue.delivered()
+        if not delivered:
+            return 0
+        wanted = (StageRow.id.in_({stage_id for stage_id, _ in delivered.values()}), ~_over())
+        with self._catalog.reading() as session:
+            alive = {
+                (id, attempt) for id, attempt in session.execute(select(StageRow.id, StageRow.attempt).where(*wanted))
+            }
+        spent = [tag for tag, pair in delivered.items() if pair not in alive]
+        if spent:
+            self._queue.drop(spent)
+        return len(spent)
+
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:
             query = select(StageRow.id).where(*conditions).order_by(StageRow.id).limit(BATCH)  # type: ignore[arg-type]
@@ -152,6 +169,10 @@ class Reconciler:
     def _now(self) -> datetime:
         with self._catalog.reading() as session:
             return self._catalog.now(session)
+
+
+def _over() -> ColumnElement[bool]:
+    return StageRow.state.in_([state for state in StageState if state.final])
 
 
 def lease_lost(

@@ -125,6 +125,8 @@ class Sweeper:
             over = trainings.holding_outputs(session, self._catalog.now(session) - grace)
         for training in over:
             with self._catalog.transaction() as tx:
+                if not trainings.lock(tx.session, training.id).state.final:  # begun again in this moment
+                    continue
                 used = outputs.of_training(tx.session, training.id)
                 outputs.forget_uses(tx, training_id=training.id)
                 kept = [key for key in used if not doom_output(tx, key)]

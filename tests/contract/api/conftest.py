@@ -18,6 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
 from l3ps_cli.main import app
+from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import QUEUES, STOP_WORKER, TRAINER_QUEUES, WORKER, Stack, StackOptions, free_port
 from l3ps_platform import workflow
@@ -39,7 +40,7 @@ MiB = 1 << 20
 TUNING = {
     **{"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"},
     **{"L3PS_WEBHOOK_ALLOW": "127.0.0.1/32", "L3PS_WEBHOOK_HTTP": "1"},
-    **{"L3PS_WEBHOOK_RETRY_SECONDS": "0,0.1,0.1", "L3PS_WEBHOOK_TIMEOUT_SECONDS": "2"},
+    **{"L3PS_WEBHOOK_RETRY_SECONDS": "0,0.1,0.1", "L3PS_WEBHOOK_TIMEOUT_SECONDS": "3"},
     "L3PS_LOG_FORMAT": "json",  # test_logs reads them
 }
 
@@ -153,24 +154,25 @@ def service(request, tmp_path_factory) -> Iterator[Service]:
 
 
 @contextmanager
-def _embedded(request, data) -> Iterator[Settings]:
+def _embedded(request, data, training: bool = True) -> Iterator[Settings]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in TUNING.items():
             patch.setenv(name, value)
-        with Stack(StackOptions(data, port=0, training=True)) as stack:
+        with Stack(StackOptions(data, port=0, training=training)) as stack:
             yield Settings(data_dir=data, port=int(stack.url.rpartition(":")[2]), token=stack.token)
 
 
 @contextmanager
-def _servers(request, data) -> Iterator[Settings]:
+def _servers(request, data, redis_database: int = 1) -> Iterator[Settings]:
     postgres, minio, redis = map(request.getfixturevalue, ("postgres_server", "minio_server", "redis_server"))
     with psycopg.connect(postgres.get_uri(), autocommit=True) as connection:
-        connection.execute("CREATE DATABASE service")  # its reconciler would tidy up in other tests' catalogs
+        database = f"service_{redis_database}"  # its reconciler would tidy up in other tests' catalogs
+        connection.execute(f"CREATE DATABASE {database}")
     settings = Settings(
         data_dir=data,
-        database_url=postgres.get_uri(database="service"),
+        database_url=postgres.get_uri(database=database),
         objects_url=f"s3://{minio}/l3ps-{secrets.token_hex(4)}?secure=0",
-        redis_url=redis.removesuffix("/0") + "/1",  # its worker takes every message, other tests' too
+        redis_url=f"{redis.removesuffix('/0')}/{redis_database}",  # its worker takes every message, other tests' too
         port=free_port(),
         token=secrets.token_urlsafe(32),
     )
@@ -249,6 +251,22 @@ def bundle(tmp_path_factory) -> Path:
     }
     (folder / "model.json").write_text(json.dumps(description))
     return folder
+
+
+@pytest.fixture(scope="session")
+def observed(service, drive_log, bundle, tmp_path_factory) -> dict:
+    """A job that was looked after: its document once it succeeded, with the id of the request that made it."""
+    folder = tmp_path_factory.mktemp("observed")
+    pack_log(drive_log, folder / "log.tar")
+    pack_bundle(bundle, folder / "model.zip")
+    model = service.upload((folder / "model.zip").read_bytes(), "model.zip", "model", name="observed").json()
+    drive = service.upload((folder / "log.tar").read_bytes() + bytes(512), "log.tar").json()
+    service.wait(f"/v1/models/{model['id']}", lambda document: document["state"] == "ready")
+    request = {"drive_id": drive["id"], "model": "observed", "preset": "fast"}
+    answer = service.http.post("/v1/jobs", json=request, headers={"X-Request-Id": "test-4711"})
+    job = service.wait_for_job(answer.json()["id"])
+    assert job["state"] == "succeeded", job
+    return job | {"request": answer.headers["x-request-id"]}
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """One look at the catalog for all who listen, in this process: what streams cost, and what slow clients miss."""
 
 import asyncio
+import shutil
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -10,17 +11,26 @@ from sqlalchemy import event
 from l3ps_api.events import hub as hub_module
 from l3ps_api.events import stream as stream_module
 from l3ps_api.events.hub import Entry, EventHub
+from l3ps_api.events.service import admit
 from l3ps_api.events.stream import EventStream, Feed, told
+from l3ps_api.problems import ApiProblem
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, DriveState, drives, events
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.workflow import notices
 
 
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalog without rows, to be copied."""
+    path = tmp_path_factory.mktemp("fresh") / "catalog.db"
+    upgrade(f"sqlite:///{path}")
+    return path
+
+
 @pytest.fixture
-def catalog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Catalog]:
+def catalog(fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Catalog]:
     monkeypatch.setattr(hub_module, "TICK_SECONDS", 0.01)
-    url = f"sqlite:///{tmp_path / 'catalog.db'}"
-    upgrade(url)
+    url = f"sqlite:///{shutil.copy(fresh, tmp_path)}"
     made = Catalog(url).scoped(DEFAULT_PROJECT)
     yield made
     made.dispose()
@@ -154,6 +164,18 @@ def test_streams_end_when_the_hub_closes(catalog) -> None:
     asyncio.run(play())
 
 
+def test_a_stream_does_not_outlive_its_credentials_for_long(catalog, monkeypatch) -> None:
+    monkeypatch.setattr(stream_module, "LIFE_SECONDS", 0.05)
+    monkeypatch.setattr(stream_module, "HEARTBEAT_SECONDS", 0.02)
+
+    async def play() -> None:
+        hub = EventHub(catalog)
+        assert {piece async for piece in told(hub, feed(catalog))} <= {b"retry: 2000\n\n", b": ping\n\n"}
+        assert hub.listeners == 0
+
+    asyncio.run(play())
+
+
 def test_a_stream_ends_when_the_log_cannot_be_read(catalog, tmp_path) -> None:
     """The client comes back, and is told then by the route."""
 
@@ -166,6 +188,19 @@ def test_a_stream_ends_when_the_log_cannot_be_read(catalog, tmp_path) -> None:
         await anext(stream)
         assert await anext(stream, None) is None
         assert hub.listeners == 0
+
+    asyncio.run(play())
+
+
+def test_there_is_an_end_to_the_number_of_streams(catalog) -> None:
+    async def play() -> None:
+        hub = EventHub(catalog)
+        async with hub.listening(), hub.listening():
+            admit(hub, 3)
+            with pytest.raises(ApiProblem) as caught:
+                admit(hub, 2)
+        assert (caught.value.status, caught.value.headers["Retry-After"]) == (503, "5")
+        admit(hub, 2)
 
     asyncio.run(play())
 

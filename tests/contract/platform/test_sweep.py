@@ -14,6 +14,7 @@ from l3ps_platform.catalog import (
     DriveRow,
     JobRow,
     OutputRow,
+    ProjectRow,
     StageName,
     bundles,
     drives,
@@ -292,6 +293,14 @@ def test_retention_by_size_takes_the_oldest_until_it_fits(house) -> None:
     with house.catalog.transaction() as tx:
         retention.put(tx, max_age_days=None, max_bytes=None)
     assert house.sweep()["expired_jobs"] == 0
+
+
+def test_labels_of_a_deleted_project_go(house) -> None:
+    job = house.job()
+    with house.catalog.transaction() as tx:
+        tx.session.get_one(ProjectRow, PROJECT).deleted_at = tx.now
+    assert house.sweep()["expired_jobs"] == 1
+    assert house.groups() == set(), job
 
 
 def test_one_sweeps_at_a_time(house) -> None:

@@ -30,7 +30,7 @@ class Store:
 
     def __init__(self, **files: bytes) -> None:
         self.files, self.breaks, self.ranges = files, [], []
-        self.honours_if_range, self.signature, self.listed = True, "1", 0
+        self.honours_if_range, self.signature, self.listed, self.etags = True, "1", 0, True
 
     def answer(self, handler):
         path, _, query = handler.path.partition("?")
@@ -48,7 +48,7 @@ class Store:
         asked = handler.headers.get("range")
         self.ranges.append(asked)
         etag = f'"{hashlib.md5(data).hexdigest()}"'
-        status, headers, start = 200, {"ETag": etag}, 0
+        status, headers, start = 200, {"ETag": etag} if self.etags else {}, 0
         if asked and (not self.honours_if_range or handler.headers.get("if-range") == etag):
             start = int(re.fullmatch(r"bytes=(\d+)-", asked)[1])
             if start >= len(data):
@@ -138,6 +138,13 @@ def test_an_archive_is_shorter_by_now(tmp_path):
         store.files["labels.tar"], store.breaks, store.honours_if_range = b"short", [], False
         store.client.labels.archive("job_1", tmp_path / "all.tar")
         assert names(tmp_path) == ["all.tar"] and (tmp_path / "all.tar").read_bytes() == b"short"
+
+
+def test_an_archive_tells_its_size_as_it_comes(tmp_path):
+    with store_of(**{"labels.tar": LARGE}) as store:
+        told = []
+        store.client.labels.archive("job_1", tmp_path / "all.tar", progress=lambda *bytes: told.append(bytes))
+        assert told[-1] == (len(LARGE),) * 2
 
 
 def test_a_damaged_file_is_fetched_again_and_then_refused(tmp_path):
@@ -249,3 +256,20 @@ def test_how_often_is_bounded(tmp_path):
         with pytest.raises(Unreachable):
             client.labels.download("job_1", tmp_path)
         assert len(store.ranges) == 3
+
+
+def test_a_file_without_a_name_for_its_bytes_starts_over(tmp_path):
+    with store_of(c=LARGE) as store:
+        store.breaks, store.etags = [2 << 20], False
+        store.client.labels.download("job_1", tmp_path)
+        assert store.ranges == [None, None] and (tmp_path / "c").read_bytes() == LARGE
+
+
+def test_a_file_larger_than_announced_does_not_fill_the_disk(tmp_path):
+    with store_of(a=b"0123") as store:
+        listing = store.listing()
+        store.listing = lambda: listing
+        store.files["a"] = LARGE
+        with pytest.raises(Damaged, match="larger"):
+            store.client.labels.download("job_1", tmp_path)
+        assert names(tmp_path) == []

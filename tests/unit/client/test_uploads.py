@@ -300,6 +300,37 @@ def test_a_killed_process_leaves_a_note_and_the_next_one_goes_on(service, client
     assert service.whole("upl_1") == file.read_bytes()
 
 
+def test_ctrl_c_ends_a_process_between_two_parts_and_the_next_one_goes_on(service, client, file, tmp_path):
+    code = (
+        "import sys, l3ps_client, pathlib\n"
+        "url, file, state = sys.argv[1:]\n"
+        "with l3ps_client.Client(url, state=pathlib.Path(state)) as client:\n"
+        "    try:\n"
+        "        client.drives.upload(file, parallel=1)\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+    )
+    arrived, stopped = threading.Event(), threading.Event()
+
+    def hold(method, path):
+        if method != "PUT" or service.puts()[-1] < 4:
+            return None
+        arrived.set()
+        stopped.wait(30)
+        return 503, {}, {"Retry-After": "5"}
+
+    service.faults.append(hold)
+    process = subprocess.Popen([sys.executable, "-c", code, service.url, str(file), str(tmp_path / "notes")])
+    assert arrived.wait(30)
+    process.send_signal(signal.SIGINT)
+    stopped.set()
+    assert process.wait(30) == 130
+    assert service.uploads["upl_1"]["state"] == "open"
+    service.faults.clear()
+    client.drives.upload(file)
+    assert list(service.uploads) == ["upl_1"] and service.whole("upl_1") == file.read_bytes()
+
+
 def test_killed_between_announcement_and_answer_the_same_upload_is_used(service, client, file):
     """The key is noted before the announcement leaves, so the next process gets the upload that was opened."""
     service.faults.append(only(lambda method, path: path == "/v1/uploads" and service.uploads, DOWN))

@@ -36,7 +36,7 @@ class Jobs:
         if len(self.states) > 1 and stream != 503:
             self.states.pop(0)
         if isinstance(stream, int):
-            reply(handler, stream, {"detail": "No."})
+            reply(handler, stream, None if stream == 204 else {"detail": "No."})
             return
         handler.send_response(200)
         handler.send_header("content-type", "text/event-stream")
@@ -104,13 +104,19 @@ def test_what_has_not_changed_is_told_once():
 
 
 def test_events_are_followed_over_broken_connections():
-    with jobs(["running"], [event(1) + event(2), 503, event(3), 403]) as service:
+    with jobs(["running"], [event(0, "open") + event(1) + event(2), 503, event(3), 403]) as service:
         followed = service.client.events.follow(kinds=["job.running"])
         got = [next(followed).id for _ in range(3)]
         assert got == ["1", "2", "3"]
         with pytest.raises(Forbidden):
             next(followed)
         assert service.seen == [None, "2", "2", "3"]
+
+
+def test_the_events_of_a_job_end_when_there_will_be_no_more():
+    with jobs(["running"], [event(1), "", event(2), 204]) as service:
+        assert [event.id for event in service.client.jobs.events("job_1")] == ["1", "2"]
+        assert service.seen == [None, "1", "1", "2"]
 
 
 def test_a_stream_that_never_comes_back_is_reported():

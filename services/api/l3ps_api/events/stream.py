@@ -21,6 +21,8 @@ log = structlog.get_logger(__name__)
 
 HEARTBEAT_SECONDS = 15.0
 RETRY_MS = 2000
+LIFE_SECONDS = 900.0
+"""A stream lives no longer: whose key was revoked meanwhile does not come back, others go on where they were."""
 SEND_SECONDS = 30.0
 """A client that takes nothing for so long, its buffers and ours full, is hung up on."""
 
@@ -72,15 +74,16 @@ class EventStream(StreamingResponse):
 
 
 async def told(hub: EventHub, feed: Feed) -> AsyncIterator[bytes]:
-    """The stream's bytes. Ends with the job, when the process stops, or when the log cannot be read."""
+    """The stream's bytes. Ends with the job, in good time, when the process stops, or when the log cannot be read."""
     yield format_sse_event(retry=RETRY_MS) + feed.opening
     if feed.over:
         return
     cursor, shown = feed.cursor, None
     clock = asyncio.get_running_loop().time
     last_sent = clock()
+    ends = last_sent + LIFE_SECONDS
     async with hub.listening(feed.job_id):
-        while not hub.closing:
+        while not hub.closing and clock() < ends:
             news = hub.news
             try:
                 found, cursor, more = await _after(hub, feed, cursor)

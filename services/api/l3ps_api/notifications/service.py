@@ -36,7 +36,7 @@ def take(services: Services, project_id: str, notification: Notification) -> Not
     with services.catalog.transaction() as tx:
         new = rules.note(tx, list(found.values()))
     if new:
-        settle_arrivals(services.catalog, _SECONDS)
+        settle_arrivals(services.catalog, _SECONDS, services.settings.max_active_jobs)
     ignored = len(notification.records) - met
     log.info("notification", accepted=len(new), known=len(found) - len(new), ignored=ignored)
     return Noted(accepted=len(new), known=len(found) - len(new), ignored=ignored)
