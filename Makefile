@@ -5,7 +5,8 @@ PYTHON ?= python3
 RUN = $(UV) run --no-sync
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hostile bench bench-train lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
+.PHONY: help demo test hostile fuzz-api chaos load bench bench-train bench-scaling bench-transfer
+.PHONY: lint format setup setup-dev setup-trainer servers compose-check compose-chaos demo-model clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -18,6 +19,15 @@ test: lint servers ## style, types, import rules and every test
 
 hostile: servers ## every hostile upload on both stacks, a million empty files among them; ONLY=names takes some
 	L3PS_HOSTILE="$(or $(ONLY),.)" $(RUN) pytest tests/hostile --timeout 3600
+
+chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
+	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
+
+bench-scaling: servers ## the same scenes with one worker and with two, one thread each
+	$(RUN) python tests/load/scaling.py
+
+fuzz-api: servers ## send the API what its OpenAPI document allows and forbids; EXAMPLES=200 an operation take minutes
+	L3PS_FUZZ_EXAMPLES=$(or $(EXAMPLES),200) $(RUN) pytest -s --timeout 900 tests/contract/api/test_openapi_document.py
 
 lint: setup-dev
 	$(RUN) ruff check .
@@ -57,6 +67,12 @@ bench-train: setup-dev ## train on IMAGES=folder over BACKBONE=spec, score on VA
 	$(RUN) l3ps train "$(IMAGES)" --backbone "$(BACKBONE)" --validation "$(VALIDATION)" --fresh --out bench-train \
 	  $(if $(CLASSES),--classes "$(CLASSES)") $(if $(COUNT),--images $(COUNT))
 
+load: servers ## 200 clients read their job's status for 3 minutes while two workers are busy; writes load-report.json
+	$(RUN) python tests/load/status.py
+
+bench-transfer: servers ## a large file up and down beside the bare minio client; MB=2048 ROUNDS=3; transfer-report.json
+	$(RUN) python tests/load/transfer.py $(if $(MB),--mb $(MB)) $(if $(ROUNDS),--rounds $(ROUNDS))
+
 compose-check: setup ## bring the compose stack up with a real Docker engine, push a drive through, tear it down
 	$(RUN) python deploy/compose_check.py
 
@@ -72,4 +88,4 @@ demo-model: setup-dev ## train the demo's model again, from thirty simulated ima
 	cp demo-model/bundle/model.* demo-model/bundle/report.* services/cli/l3ps_cli/models/demo/
 
 clean: ## remove what the targets made here
-	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train
+	rm -rf .venv .tools .mypy_cache .ruff_cache .hypothesis demo demo-model bench-train chaos-report.*

@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn
 
 import pytest
@@ -96,11 +97,7 @@ def postgres_url(postgres_server: Any) -> Iterator[str]:
 @pytest.fixture(scope="session")
 def minio_binary() -> Path:
     """The MinIO server's program."""
-    spec = importlib.util.spec_from_file_location("setup_servers", ROOT / "tests" / "setup_servers.py")
-    assert spec and spec.loader
-    setup = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(setup)
-    binary = setup.minio_path()
+    binary = setup_servers().minio_path()
     if not binary.is_file():
         missing(f"MINIO MISSING: no {binary}; run `python tests/setup_servers.py`, which builds it")
     return Path(binary)
@@ -116,6 +113,30 @@ def minio_server(minio_binary: Path, tmp_path_factory: pytest.TempPathFactory) -
     with running(command, folder / "log", lambda: healthy(port), env=environment):
         yield f"tester:tester-secret@127.0.0.1:{port}"
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def prometheus_tool() -> Callable[[str], Path]:
+    """Finds ``promtool`` or ``prometheus``; without it the test is skipped, in CI too: not every machine has it."""
+
+    def find(name: str) -> Path:
+        found = setup_servers().prometheus_tool(name)
+        if found is None:
+            pytest.skip(
+                f"PROMETHEUS MISSING: no {name}; run `python tests/setup_servers.py`, which fetches it with apt"
+            )
+        return found
+
+    return find
+
+
+def setup_servers() -> ModuleType:
+    """The module that knows where servers are; it is no part of a package."""
+    spec = importlib.util.spec_from_file_location("setup_servers", ROOT / "tests" / "setup_servers.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

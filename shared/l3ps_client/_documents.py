@@ -210,6 +210,9 @@ class LabelFile(TypedDict):
     size: int
     sha256: str
     url: str
+    side: NotRequired[Side | None]
+    scene: NotRequired[str | None]
+    scan: NotRequired[str | None]
 
 
 class LabelFiles(TypedDict):
@@ -237,14 +240,20 @@ class Project(TypedDict):
 
 
 class Key(TypedDict):
-    """An API key; ``secret`` is there only in the answer that makes or rotates it."""
+    """An API key; ``secret`` is there only in the answer that makes or rotates it.
+
+    It is None in the answer to a request that was repeated because its answer was lost: rotate the key then.
+    """
 
     id: str
     name: str
     scope: Literal["read", "write", "admin"]
     created_at: str
     expires_at: NotRequired[str | None]
-    secret: NotRequired[str]
+    revoked_at: NotRequired[str | None]
+    last_used_at: NotRequired[str | None]
+    previous_until: NotRequired[str | None]
+    secret: NotRequired[str | None]
 
 
 class Webhook(TypedDict):
@@ -252,24 +261,50 @@ class Webhook(TypedDict):
 
     id: str
     url: str
+    events: list[str]
+    description: str
+    enabled: bool
+    disabled_reason: str | None
+    failing_since: str | None
+    previous_secret_until: str | None
     created_at: str
-    secret: NotRequired[str]
+    secret: NotRequired[str | None]
 
 
 class Delivery(TypedDict):
-    """One event on its way to a webhook, and how it fared."""
+    """One message on its way to a webhook, and how it fared; ``id`` is its ``webhook-id`` at every attempt."""
 
     id: str
+    webhook_id: str
+    type: str
+    state: Literal["pending", "delivered", "failed"]
+    attempts: int
+    next_at: str | None
+    last_status: int | None
+    last_error: str | None
+    created_at: str
+    delivered_at: str | None
+    body: str
+    log: list[dict[str, Any]]
 
 
 class Rule(TypedDict):
-    """What turns a finished upload of a bucket into a job."""
+    """What turns a log that arrives in a bucket into a job."""
 
     id: str
+    name: str
+    bucket: str
+    prefix: str
+    suffix: NotRequired[str | None]
+    model: str
+    arrivals: int
+    latest: NotRequired[dict[str, Any] | None]
+    created_at: str
 
 
 class Retention(TypedDict):
     """How long and how much a project's finished results are kept; None for no bound."""
 
-    max_age_days: float | None
+    max_age_days: int | None
     max_bytes: int | None
+    stored_bytes: NotRequired[int]

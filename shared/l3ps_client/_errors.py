@@ -26,7 +26,15 @@ class L3psClientError(Exception):
 
 
 class Unreachable(L3psClientError):  # noqa: N818
-    """The service does not answer, or says that it cannot work just now."""
+    """The service does not answer, or says that it cannot work just now.
+
+    Attributes:
+        retry_after: seconds until trying again makes sense, where the service says so.
+    """
+
+    def __init__(self, message: str, retry_after: float | None = None) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
 
 
 class Refused(L3psClientError):  # noqa: N818

@@ -28,9 +28,16 @@ class Events(Group):
 class Webhooks(Group):
     """``client.webhooks``: addresses that the service tells of events; for keys of scope ``admin``."""
 
-    def create(self, url: str, *, kinds: Sequence[str] | None = None, **fields: Any) -> Webhook:
-        """Have events sent to a URL; ``secret``, which ``webhooks.verify`` needs, is in this answer and never again."""
-        webhook: Webhook = self._wire.post(path("webhooks"), _fields(url=url, kinds=kinds, **fields))
+    def create(self, url: str, *, events: Sequence[str] = (), description: str = "") -> Webhook:
+        """Have events sent to a URL; ``secret``, which ``webhooks.verify`` needs, is in this answer and never again.
+
+        Args:
+            url: of the receiver: https, and a public address.
+            events: only these kinds, such as ``job.succeeded`` or the group ``job.*``; all where empty.
+            description: for whoever reads the list.
+        """
+        body = {"url": url, "events": [*events], "description": description}
+        webhook: Webhook = self._wire.post(path("webhooks"), body)
         return webhook
 
     def get(self, webhook_id: str) -> Webhook:
@@ -43,7 +50,7 @@ class Webhooks(Group):
         return items(self._wire, path("webhooks"), limit)
 
     def update(self, webhook_id: str, *, if_match: str | None = None, **fields: Any) -> Webhook:
-        """Change fields of a webhook; with ``if_match`` only where its ETag is still that."""
+        """Change ``url``, ``events``, ``description`` or ``enabled``; ``if_match``: only while its ETag is that."""
         where = path("webhooks", webhook_id)
         webhook: Webhook = self._wire.put(where, fields, method="PATCH", if_match=if_match)
         return webhook
@@ -52,34 +59,54 @@ class Webhooks(Group):
         """Send nothing there any more."""
         self._wire.delete(path("webhooks", webhook_id))
 
-    def rotate(self, webhook_id: str) -> Webhook:
-        """Give a webhook a new secret; deliveries are signed with both for a while."""
-        webhook: Webhook = self._wire.post(path("webhooks", webhook_id, "rotate"))
+    def rotate(self, webhook_id: str, *, overlap_seconds: int | None = None) -> Webhook:
+        """Give a webhook a new secret; messages carry a signature by each for ``overlap_seconds``, or a day."""
+        body = {} if overlap_seconds is None else {"overlap_seconds": overlap_seconds}
+        webhook: Webhook = self._wire.post(path("webhooks", webhook_id, "rotate"), body)
         return webhook
 
-    def test(self, webhook_id: str) -> Any:
-        """Send a test event there."""
-        return self._wire.post(path("webhooks", webhook_id, "test"))
+    def test(self, webhook_id: str) -> Delivery:
+        """Send a message of type ``ping`` there; the deliveries tell what came of it."""
+        delivery: Delivery = self._wire.post(path("webhooks", webhook_id, "test"))
+        return delivery
 
-    def replay(self, webhook_id: str, *, since: str) -> Any:
-        """Send all events since a time (ISO 8601) again."""
-        return self._wire.post(path("webhooks", webhook_id, "replay"), {"since": since})
+    def replay(self, webhook_id: str, *, since: str) -> int:
+        """Make all deliveries that failed since a time (ISO 8601) again; how many they are."""
+        return int(self._wire.post(path("webhooks", webhook_id, "replay"), {"since": since})["count"])
 
-    def deliveries(self, webhook_id: str, *, limit: int | None = None) -> Iterator[Delivery]:
+    def deliveries(self, webhook_id: str, *, limit: int | None = None, state: str | None = None) -> Iterator[Delivery]:
         """What was sent there and how it fared, newest first."""
-        return items(self._wire, path("webhooks", webhook_id, "deliveries"), limit)
+        return items(self._wire, path("webhooks", webhook_id, "deliveries"), limit, state=state)
 
-    def redeliver(self, webhook_id: str, delivery_id: str) -> Any:
-        """Send one delivery again."""
-        return self._wire.post(path("webhooks", webhook_id, "deliveries", delivery_id, "replay"))
+    def redeliver(self, webhook_id: str, delivery_id: str) -> Delivery:
+        """Make one delivery again, under the same message id."""
+        delivery: Delivery = self._wire.post(path("webhooks", webhook_id, "deliveries", delivery_id, "replay"))
+        return delivery
 
 
 class Rules(Group):
     """``client.rules``: what turns a finished upload of a bucket into a job; for keys of scope ``admin``."""
 
-    def create(self, **fields: Any) -> Rule:
-        """Make a rule; fields as ``/openapi.json`` describes them."""
-        rule: Rule = self._wire.post(path("rules"), fields)
+    def create(
+        self, name: str, *, bucket: str, model: str, prefix: str = "", suffix: str | None = None, **settings: Any
+    ) -> Rule:
+        """Make a rule.
+
+        Args:
+            name: for whoever reads the list.
+            bucket: which the service may read.
+            model: name or id of a model.
+            prefix: only objects below it; all of the bucket where empty.
+            suffix: only objects whose key ends so; one such as ``_SUCCESS`` says that its folder is complete.
+            settings: of the jobs, as of ``jobs.create``.
+        """
+        body = _fields(name=name, bucket=bucket, model=model, prefix=prefix, suffix=suffix, **settings)
+        rule: Rule = self._wire.post(path("rules"), body)
+        return rule
+
+    def get(self, rule_id: str) -> Rule:
+        """A rule and what arrived last."""
+        rule: Rule = self._wire.get(path("rules", rule_id))
         return rule
 
     def list(self, *, limit: int | None = None) -> Iterator[Rule]:

@@ -95,7 +95,11 @@ class Jobs(Group):
         self._wire.delete(path("jobs", job_id))
 
     def events(self, job_id: str, *, after: str | None = None) -> Iterator[Event]:
-        """What happens to a job, as it happens; ``after`` is the id of the last event that is known already."""
+        """What happens to a job, as it happens, until it is over; a broken connection is taken up where it was.
+
+        First comes the job itself, as ``snapshot``, unless ``after`` gives the id of the last event that is known
+        already; between the events ``progress`` tells how far the stages are.
+        """
         return follow(self._wire, path("jobs", job_id, "events"), {}, after)
 
     def watch(self, job_id: str, *, timeout: float | None = None, poll: float | None = None) -> Iterator[Job]:

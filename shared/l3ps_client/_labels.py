@@ -10,8 +10,8 @@ from threading import Lock
 from typing import Any
 
 from l3ps_client._documents import LabelFile, LabelFiles
-from l3ps_client._errors import Forbidden, L3psClientError
-from l3ps_client._receiving import Source, inside, receive
+from l3ps_client._errors import Forbidden
+from l3ps_client._receiving import Count, Source, inside, receive
 from l3ps_client._resource import Group, path
 from l3ps_client._sending import Progress
 
@@ -79,7 +79,7 @@ class Labels(Group):
         """
         listing = _Listing(self, job_id, {"format": format, "side": side}, scenes, scans)
         targets = {file["path"]: Path(folder) / inside(file["path"]) for file in listing.files}
-        count = _Count(progress, sum(file["size"] for file in listing.files))
+        count = Count(progress, sum(file["size"] for file in listing.files))
         with ThreadPoolExecutor(parallel) as pool:
             try:
                 waiting = [
@@ -111,17 +111,17 @@ class Labels(Group):
             jobs: id of a job that succeeded, or several.
             file: the archive to write; it appears when it is whole.
             format: as of ``list``.
-            progress: called with (bytes there, 0): nobody knows the size before the end.
+            progress: called with (bytes there, bytes in all).
         """
         one = jobs if isinstance(jobs, str) else None
         where = path("jobs", one, "labels.tar") if one else path("labels.tar")
         params: dict[str, Any] = {"format": format} | ({} if one else {"job": [*jobs]})
         target = Path(file)
         target.parent.mkdir(parents=True, exist_ok=True)
-        receive(self._wire, Source(where, False, params), target, _Count(progress, 0).add)
+        receive(self._wire, Source(where, False, params), target, Count(progress))
         return target
 
-    def _fetch(self, listing: _Listing, file: LabelFile, target: Path, count: _Count) -> None:
+    def _fetch(self, listing: _Listing, file: LabelFile, target: Path, count: Count) -> None:
         if target.is_file() and target.stat().st_size == file["size"] and _sha256(target) == file["sha256"]:
             count.add(file["size"])
             return
@@ -129,7 +129,7 @@ class Labels(Group):
         url = file["url"]
         for fresh in (False, True):
             try:
-                receive(self._wire, Source(url, True, {}, file["size"], file["sha256"]), target, count.add)
+                receive(self._wire, Source(url, True, {}, file["size"], file["sha256"]), target, count)
                 return
             except Forbidden:
                 if fresh:
@@ -166,26 +166,6 @@ class _Listing:
     def _ask(self) -> dict[str, LabelFile]:
         listed = [self._labels.list(self._job_id, **self._filters, **which)["files"] for which in self._which]
         return {file["path"]: file for files in listed for file in files}
-
-
-class _StoppedError(L3psClientError):
-    """Another file failed, or the user had enough."""
-
-
-class _Count:
-    """Bytes there, told one call at a time."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._done, self._total, self._lock = progress, 0, total, Lock()
-        self.stopped = False
-
-    def add(self, count: int) -> None:
-        if self.stopped:
-            raise _StoppedError
-        if count:
-            with self._lock:
-                self._done += count
-                self._progress(self._done, self._total)
 
 
 def _sha256(path: Path) -> str:

@@ -5,15 +5,18 @@ A note holds no URL and no token: a presigned URL is a credential, and the servi
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
+
+if sys.platform != "win32":
+    import fcntl
 
 _KEEP_SECONDS = 30 * 24 * 3600
 """Services forget an open upload after a day, or as configured; a note older than this is of no use to anybody."""
@@ -96,7 +99,8 @@ class Ledger:
         except OSError:
             return None
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if sys.platform != "win32":  # there two processes with the same file would share its upload
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             file.close()
             return None

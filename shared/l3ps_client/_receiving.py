@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import time
@@ -10,16 +9,46 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from threading import Lock
 from typing import Any
 
 import httpx
 
+from l3ps_client._bulk import BULK
+from l3ps_client._digest import Digest
 from l3ps_client._errors import Damaged, Refused, TooManyRequests, Unreachable
+from l3ps_client._sending import Progress
 from l3ps_client._wire import Wire
 
 _RESUME_FROM = 1 << 20
 """Bytes from which on it pays to note how far a file has come; smaller ones start over."""
 _BLOCK = 1 << 20
+
+
+class Count:
+    """Bytes there of one file or several, told one call at a time.
+
+    Attributes:
+        total: bytes in all; 0 while nobody knows.
+        stopped: further bytes are not wanted: another file failed, or the user had enough.
+    """
+
+    def __init__(self, progress: Progress, total: int = 0) -> None:
+        self.total, self.stopped = total, False
+        self._progress, self._done, self._lock = progress, 0, Lock()
+
+    def add(self, count: int) -> None:
+        """So many more are there."""
+        if self.stopped:
+            raise _StoppedError
+        if count:
+            with self._lock:
+                self._done += count
+                self._progress(self._done, self.total)
+
+
+class _StoppedError(Exception):
+    """Further bytes are not wanted."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +70,23 @@ class Source:
     sha256: str | None = None
 
 
-def receive(wire: Wire, source: Source, target: Path, report: Callable[[int], None]) -> None:
-    """Bring a file; ``report`` is called with bytes newly there, negative where they turned out useless.
+def receive(wire: Wire, source: Source, target: Path, count: Count) -> None:
+    """Bring a file; ``count`` is told of bytes newly there, negative where they turned out useless.
 
     Raises Damaged when twice in a row the bytes were not those announced; nothing of them is kept then.
     """
     partial = _Partial(target, source)
     for fresh in (False, True):
         if fresh:
-            report(-partial.length)
+            count.add(-partial.length)
             partial.drop()
         try:
-            _complete(wire, source, partial, report)
+            _complete(wire, source, partial, count)
             partial.finish(target)
             return
         except Damaged:
             if fresh:
-                report(-partial.length)
+                count.add(-partial.length)
                 partial.drop()
                 raise
         except BaseException:
@@ -74,56 +103,62 @@ def inside(path: str) -> PurePosixPath:
     return relative
 
 
-def _complete(wire: Wire, source: Source, partial: _Partial, report: Callable[[int], None]) -> None:
+def _complete(wire: Wire, source: Source, partial: _Partial, count: Count) -> None:
     """Go on until all is there; a connection that brought something does not count as a failed try."""
-    report(partial.length)
+    count.add(partial.length)
     attempt = 1
     while True:
         before = partial.length
         try:
-            _once(wire, source, partial, report)
+            _once(wire, source, partial, count)
             return
         except (Unreachable, TooManyRequests) as error:
             attempt = 1 if partial.length > before else attempt + 1
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
+            asked = error.retry_after or 0.0
             if attempt > wire.retry.tries + 2 or asked > wire.retry.longest_wait:
                 raise
             time.sleep(max(asked, wire.retry.pause(attempt)))
 
 
-def _once(wire: Wire, source: Source, partial: _Partial, report: Callable[[int], None]) -> None:
+def _once(wire: Wire, source: Source, partial: _Partial, count: Count) -> None:
     if source.size is not None and partial.length == source.size:
         return
+    if not partial.etag:  # nothing tells whether other bytes would go with these
+        count.add(-partial.length)
+        partial.drop()
     asked = partial.length
+    bulk = source.size is None or source.size - asked >= BULK
     headers = {"Range": f"bytes={asked}-", "If-Range": partial.etag} if asked else {}
     with (
-        _starting_over_past_the_end(partial, report),
-        wire.open(source.url, presigned=source.presigned, params=source.params, headers=headers) as answer,
+        _starting_over_past_the_end(partial, count),
+        wire.open(source.url, presigned=source.presigned, params=source.params, headers=headers, bulk=bulk) as answer,
     ):
         if asked and not _goes_on(answer, partial):
-            report(-partial.length)
+            count.add(-partial.length)
             partial.drop()
             if answer.status_code == 206:  # a range of other bytes: the store knows no If-Range
                 raise Unreachable(f"{source.url.partition('?')[0]} changed meanwhile")
         whole = _whole_length(answer)
+        if source.size is None and whole is not None:
+            count.total = whole
         partial.begin(answer.headers.get("etag", ""))
         with partial.appending() as write:
-            for block in answer.iter_raw(_BLOCK):
+            for block in answer.iter_raw():
                 write(block)
-                report(len(block))
+                count.add(len(block))
     whole = source.size if whole is None else whole
     if whole is not None and partial.length != whole:
         raise Unreachable(f"{source.url.partition('?')[0]}: {partial.length} of {whole} bytes arrived")
 
 
 @contextmanager
-def _starting_over_past_the_end(partial: _Partial, report: Callable[[int], None]) -> Iterator[None]:
+def _starting_over_past_the_end(partial: _Partial, count: Count) -> Iterator[None]:
     try:
         yield
     except Refused as error:
         if error.status != 416:
             raise
-        report(-partial.length)
+        count.add(-partial.length)
         partial.drop()
         raise Unreachable("there is less of it now than before") from error
 
@@ -154,7 +189,7 @@ class _Partial:
         self._etag_path = target.with_name(target.name + ".part.etag")
         self._source = source
         self.length, self.etag, self.noted = 0, "", False
-        self._digest = hashlib.sha256()
+        self._digest = Digest()
         with suppress(OSError, ValueError, KeyError):
             noted = json.loads(self._etag_path.read_text())
             if noted["sha256"] == source.sha256 and noted["etag"]:
@@ -183,8 +218,10 @@ class _Partial:
                 while view:
                     view = view[file.write(view) :]
                 if self._source.sha256 is not None:
-                    self._digest.update(block)
+                    self._digest.update_beside(block)
                 self.length += len(block)
+                if self._source.size is not None and self.length > self._source.size:
+                    raise Damaged(f"{self.path.stem} is larger than announced and was removed. Try again.")
                 if not self.noted and self.length >= _RESUME_FROM and self.etag:
                     self.noted = True
                     self._etag_path.write_text(json.dumps({"etag": self.etag, "sha256": self._source.sha256}))
@@ -196,7 +233,7 @@ class _Partial:
         self.path.unlink(missing_ok=True)
         self._etag_path.unlink(missing_ok=True)
         self.length, self.etag, self.noted = 0, "", False
-        self._digest = hashlib.sha256()
+        self._digest = Digest()
 
     def finish(self, target: Path) -> None:
         """Put the whole file where it belongs; Damaged when it is not what was announced."""

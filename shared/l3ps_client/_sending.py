@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,22 +141,34 @@ class _Transfer:
 
     def run(self) -> str:
         """Send what the service has not got; hex SHA-256 of the whole file."""
-        known = self._options.sha256
-        with ThreadPoolExecutor(self._options.parallel + (known is None)) as pool:
-            digest = None if known else pool.submit(self._sha256)
-            waiting: list[Future[Any]] = [pool.submit(self._part, number) for number in self._numbers]
+        with ThreadPoolExecutor(self._options.parallel) as pool, ThreadPoolExecutor(1) as beside:
+            digest = beside.submit(self._or_stop, self._sha256)
+            work: list[Future[Any]] = [pool.submit(self._or_stop, self._part, number) for number in self._numbers]
             try:
-                for future in as_completed(waiting + ([digest] if digest else [])):
-                    future.result()
+                wait([digest, *work])
             except BaseException:
                 self._stop.set()
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
-            return known or (digest.result() if digest else "")
+        failures = [error for future in [*work, digest] if (error := future.exception()) is not None]
+        if failures:
+            raise next((error for error in failures if not isinstance(error, _StoppedError)), failures[0])
+        sha256: str = digest.result()
+        return sha256
 
     def tags(self) -> list[dict[str, Any]]:
         """Every part with its ETag, in order."""
         return [{"number": number, "etag": self._etags[number]} for number in self._numbers]
+
+    def _or_stop(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """Do a share of the work; where that fails, nobody need begin another one."""
+        if self._stop.is_set():
+            raise _StoppedError
+        try:
+            return work(*arguments)
+        except BaseException:
+            self._stop.set()
+            raise
 
     def _part(self, number: int) -> None:
         start = (number - 1) * self._part_size
@@ -231,6 +243,8 @@ class _Transfer:
                 left -= len(block)
 
     def _sha256(self) -> str:
+        if self._options.sha256 is not None:
+            return self._options.sha256
         digest = hashlib.sha256()
         for block in self._blocks(0, self._size):
             digest.update(block)

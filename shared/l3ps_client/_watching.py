@@ -20,6 +20,10 @@ _PATIENCE_SECONDS = 60.0
 _NO_EVENTS = (404, 405, 406, 422)
 
 
+class _NothingMoreError(Exception):
+    """What was listened to is over, and all of it has been told."""
+
+
 def watch(
     wire: Wire, resource: str, stream: str | None, timeout: float | None, poll: float | None
 ) -> Iterator[dict[str, Any]]:
@@ -58,13 +62,15 @@ def listen(
     """One connection to a stream of events; None for a sign of life. Unreachable when it breaks."""
     headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"} | ({"Last-Event-ID": after} if after else {})
     with wire.open(stream, presigned=False, headers=headers, params=params, timeout=timeout) as answer:
+        if answer.status_code == 204:
+            raise _NothingMoreError
         if not answer.headers.get("content-type", "").startswith("text/event-stream"):
             raise Refused(406, {"detail": f"{stream} is no stream of events."})
         yield from events(answer.iter_raw())
 
 
 def follow(wire: Wire, stream: str, params: dict[str, Any], after: str | None) -> Iterator[Event]:
-    """Events without an end: a connection that breaks is made again, where it was."""
+    """Events until there is nothing more to come: a connection that breaks is made again, where it was."""
     attempt = 0
     while True:
         try:
@@ -72,24 +78,29 @@ def follow(wire: Wire, stream: str, params: dict[str, Any], after: str | None) -
                 attempt = 0
                 if event is not None:
                     after = event.id or after
-                    yield event
+                    if event.kind != "open":  # it tells where the stream begins, and nothing that has happened
+                        yield event
         except (Unreachable, TooManyRequests) as error:
             attempt += 1
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
+            asked = error.retry_after or 0.0
             if attempt > wire.retry.tries + 2 or asked > wire.retry.longest_wait:
                 raise
             time.sleep(max(asked, wire.retry.pause(attempt)))
+        except _NothingMoreError:
+            return
         else:
-            time.sleep(POLL_SECONDS)  # the service ended it in good order, as it does when it stops
+            # In good order, as when the service stops, or because there will be no more: that the next try tells.
+            time.sleep(wire.retry.pause(1))
 
 
 def _occasions(wire: Wire, stream: str | None, deadline: float, poll: float) -> Generator[None, None, None]:
     """Each time that looking makes sense: now, when something happened, when the stream ended, at the deadline."""
     yield
     after: str | None = None
+    not_before = 0.0
     while True:
         left = max(deadline - time.monotonic(), 0.01)
-        if stream is None:
+        if stream is None or time.monotonic() < not_before:
             time.sleep(min(poll, left))
             yield
             continue
@@ -102,13 +113,14 @@ def _occasions(wire: Wire, stream: str | None, deadline: float, poll: float) -> 
                     yield
                     looked = time.monotonic()
         except (Unreachable, TooManyRequests) as error:
-            asked = (error.retry_after or 0.0) if isinstance(error, TooManyRequests) else 0.0
-            time.sleep(min(max(asked, POLL_SECONDS), left))
+            not_before = time.monotonic() + max(error.retry_after or 0.0, POLL_SECONDS)  # until then it is asked
         except Refused as error:
             if error.status not in _NO_EVENTS:
                 raise
             stream = None
+        except _NothingMoreError:
+            stream = None
         else:
             yield
-            time.sleep(min(POLL_SECONDS, left))
+            time.sleep(min(wire.retry.pause(1), left))
         yield

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import random
+import ssl
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
+from functools import cache
 from typing import Any
+from urllib.request import getproxies
 from uuid import uuid4
 
 import httpx
 
+from l3ps_client._bulk import BulkTransport
 from l3ps_client._config import Config
 from l3ps_client._errors import KINDS, Document, Refused, TooManyRequests, Unreachable, sentences
 
@@ -62,14 +66,18 @@ class Wire:
             headers["L3PS-Project"] = config.project
         # A proxy of the environment cannot reach this machine's own loopback interface.
         direct: dict[str, Any] = {"all://127.0.0.1": None, "all://localhost": None, "all://[::1]": None}
-        self._api = httpx.Client(base_url=config.url, headers=headers, timeout=timeout, mounts=direct)
+        common: dict[str, Any] = {"timeout": timeout, "mounts": direct, "verify": _trusted()}
+        self._api = httpx.Client(base_url=config.url, headers=headers, **common)
         # Presigned URLs carry their own credentials; S3 refuses a request that brings a second kind.
-        self._objects = httpx.Client(timeout=timeout, mounts=direct, headers={"Accept-Encoding": "identity"})
+        self._objects = httpx.Client(headers={"Accept-Encoding": "identity"}, **common)
+        self._bulk = None if getproxies() else httpx.Client(transport=BulkTransport(_trusted()), timeout=timeout)
 
     def close(self) -> None:
         """Let go of all connections."""
         self._api.close()
         self._objects.close()
+        if self._bulk is not None:
+            self._bulk.close()
 
     def get(self, path: str, **params: Any) -> Any:
         """GET a JSON document; parameters that are None are left out."""
@@ -120,10 +128,16 @@ class Wire:
     @contextmanager
     def open(
         self, url: str, *, presigned: bool, headers: Mapping[str, str] | None = None,
-        params: Mapping[str, Any] | None = None, timeout: float | None = None,
+        params: Mapping[str, Any] | None = None, timeout: float | None = None, bulk: bool = False,
     ) -> Iterator[httpx.Response]:  # fmt: skip
-        """GET an answer to read piece by piece, once; what goes wrong on the way becomes this package's errors."""
+        """GET an answer to read piece by piece, once; what goes wrong on the way becomes this package's errors.
+
+        ``bulk`` for one of many megabytes.
+        """
         client = self._objects if presigned else self._api
+        if bulk and self._bulk is not None:
+            headers = {**({} if presigned else self._api.headers), "Accept-Encoding": "identity", **(headers or {})}
+            client = self._bulk
         given = {name: value for name, value in (params or {}).items() if value is not None}
         limits = httpx.Timeout(self.timeout, read=timeout or self.timeout)
         try:
@@ -175,6 +189,12 @@ class Wire:
         )
 
 
+@cache
+def _trusted() -> ssl.SSLContext:
+    """The certificates to trust; reading them takes 20 ms of CPU time, so all clients of a process share them."""
+    return httpx.create_ssl_context()
+
+
 def new_key() -> str:
     """A fresh ``Idempotency-Key``."""
     return uuid4().hex
@@ -203,7 +223,7 @@ def refusal(answer: httpx.Response) -> Exception:
     if status == 429:
         return TooManyRequests(status, document, retry_after(answer))
     if status in _LATER + _NOT_THE_SERVICE:
-        return Unreachable("\n".join(sentences(document)))
+        return Unreachable("\n".join(sentences(document)), retry_after(answer))
     return KINDS.get(status, Refused)(status, document)
 
 

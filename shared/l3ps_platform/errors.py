@@ -4,6 +4,7 @@ l3ps.errors.L3psError
 └── PlatformError
     ├── StoreError              the object store
     │   ├── StoreUnavailable    it does not answer, or not to us; trying again later may help
+    │   │   └── OutputDoomed    the stage output is being deleted; in a moment it can be made anew
     │   ├── ObjectMissing       there is no object under this key
     │   ├── InvalidKey          the key could leave the store or would not survive a round trip
     │   ├── UploadError         a multipart upload that is unknown, or whose parts do not fit together
@@ -30,6 +31,10 @@ class StoreError(PlatformError):
 
 class StoreUnavailable(StoreError):  # noqa: N818
     """The object store does not answer, or not to these credentials."""
+
+
+class OutputDoomed(StoreUnavailable):
+    """A stage output is being deleted: in a moment it can be made anew."""
 
 
 class ObjectMissing(StoreError):  # noqa: N818

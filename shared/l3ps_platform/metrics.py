@@ -11,27 +11,44 @@ Who has more to tell adds a source: ``collector.add(source)`` with a function fr
 
 from __future__ import annotations
 
+import shutil
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime, timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import structlog
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from l3ps_platform.catalog import Catalog, JobRow, Outcome, QueueName, StageName, StageState, TrainingRow, figures
+from l3ps_platform.catalog import (
+    Catalog,
+    JobRow,
+    JobState,
+    Outcome,
+    QueueName,
+    StageName,
+    StageState,
+    TrainingRow,
+    figures,
+)
 from l3ps_platform.errors import PlatformError
 from l3ps_platform.quality_metrics import estimates, job_quality, model_quality
+from l3ps_platform.workflow.causes import Cause
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from l3ps_platform.queue import Queue
+    from l3ps_platform.settings import Settings
 
 log = structlog.get_logger(__name__)
 
 Source = Callable[["Session"], Iterable[Metric]]
+
+Sums = tuple[dict[figures.Kind, figures.Tally], dict[str, tuple[int, float]]]
+"""Of attempts by kind, and of steps by name: how often, and seconds."""
 
 LATE = timedelta(minutes=5)
 """How long after its clock was read a transaction may still commit. Ours take milliseconds; one that waits for a row
@@ -45,11 +62,14 @@ class History:
         self._until: datetime | None = None
         self._attempts: dict[figures.Kind, figures.Tally] = {}
         self._steps: dict[str, tuple[int, float]] = {}
+        self._lock = threading.Lock()  # two scrapes at once would remember the same span twice
 
-    def read(
-        self, session: Session, now: datetime
-    ) -> tuple[dict[figures.Kind, figures.Tally], dict[str, tuple[int, float]]]:
+    def read(self, session: Session, now: datetime) -> Sums:
         """The sums, of attempts by kind and of steps by name."""
+        with self._lock:
+            return self._read(session, now)
+
+    def _read(self, session: Session, now: datetime) -> Sums:
         if self._until is None or self._until < now - 2 * LATE:
             settled = now - LATE
             past = figures.tallies(session, self._until, settled), figures.step_tallies(session, self._until, settled)
@@ -121,6 +141,25 @@ class CatalogCollector(Collector):
         ]
 
 
+class DiskCollector(Collector):
+    """How much room is left where the embedded stack keeps everything; elsewhere the API has no disk of its own.
+
+    Args:
+        settings: where that is.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._folder = settings.data_dir if settings.store_url.startswith("file://") else None
+
+    def collect(self) -> Iterator[Metric]:
+        """Nothing where there is no such folder."""
+        if self._folder is None or not self._folder.is_dir():
+            return
+        usage = shutil.disk_usage(self._folder)
+        for name, value in (("free", usage.free), ("size", usage.total)):
+            yield GaugeMetricFamily(f"l3ps_disk_{name}_bytes", f"{name.title()} of the data's disk.", value=value)
+
+
 def _added(
     sums: dict[figures.Kind, figures.Tally], more: dict[figures.Kind, figures.Tally]
 ) -> dict[figures.Kind, figures.Tally]:
@@ -132,11 +171,14 @@ def _stepped(sums: dict[str, tuple[int, float]], more: dict[str, tuple[int, floa
     return sums | {name: (before[name][0] + count, before[name][1] + total) for name, (count, total) in more.items()}
 
 
+Labels = TypeVar("Labels", bound=tuple[str, ...])
+
+
 def _grouped(
-    attempts: dict[figures.Kind, figures.Tally], key: Callable[[figures.Kind], tuple[str, ...] | None]
-) -> dict[tuple[str, ...], figures.Tally]:
+    attempts: dict[figures.Kind, figures.Tally], key: Callable[[figures.Kind], Labels | None]
+) -> dict[Labels, figures.Tally]:
     """The tallies added up by label values; those without any are left out."""
-    found: dict[tuple[str, ...], figures.Tally] = {}
+    found: dict[Labels, figures.Tally] = {}
     for kind, tally in attempts.items():
         labels = key(kind)
         if labels is not None:
@@ -162,13 +204,13 @@ def _work(attempts: dict[figures.Kind, figures.Tally]) -> list[Metric]:
         points.add_metric(labels, tally.points)
         size.add_metric(labels, tally.bytes)
     refined = _grouped(attempts, lambda kind: (kind.project_id,) if _labelled(kind) else None)
-    for labels, tally in refined.items():
-        scenes.add_metric(labels, tally.count)
-    for labels, tally in _grouped(attempts, lambda kind: (kind.stage.value,) if _computed(kind) else None).items():
-        cpu.add_metric(labels, tally.cpu_seconds)
-        peak.add_metric(labels, tally.peak_mb)
+    for project, tally in refined.items():
+        scenes.add_metric(project, tally.count)
+    for stage, tally in _grouped(attempts, lambda kind: (kind.stage.value,) if _computed(kind) else None).items():
+        cpu.add_metric(stage, tally.cpu_seconds)
+        peak.add_metric(stage, tally.peak_mb)
         buckets = [(str(bound), float(count)) for bound, count in zip(figures.BOUNDS, tally.within, strict=True)]
-        seconds.add_metric(labels, [*buckets, ("+Inf", float(tally.count))], tally.seconds)
+        seconds.add_metric(stage, [*buckets, ("+Inf", float(tally.count))], tally.seconds)
     return [scans, points, size, scenes, seconds, cpu, peak]
 
 
@@ -181,7 +223,7 @@ def _labelled(kind: figures.Kind) -> bool:
 
 
 def _ends(attempts: dict[figures.Kind, figures.Tally]) -> list[Metric]:
-    """How attempts ended. Every stage has every outcome, so that the first of one shows as an increase."""
+    """How attempts ended. Every stage has every outcome and cause, so that the first of one shows as an increase."""
     ended = CounterMetricFamily("l3ps_attempts", "Attempts at stages that ended.", labels=["stage", "outcome"])
     retries = CounterMetricFamily("l3ps_retries", "Attempts that another one follows.", labels=["stage"])
     failures = CounterMetricFamily("l3ps_failures", "Attempts that failed, by cause.", labels=["stage", "cause"])
@@ -199,9 +241,9 @@ def _ends(attempts: dict[figures.Kind, figures.Tally]) -> list[Metric]:
         unused = sum(tally.cpu_seconds for outcome, tally in ends.items() if outcome is not Outcome.DONE)
         wasted.add_metric([stage.value], unused)
         cached.add_metric([stage.value], from_cache.get((stage.value,), figures.Tally()).count)
-    for labels, tally in _grouped(
-        attempts, lambda kind: (kind.stage.value, kind.cause) if kind.cause else None
-    ).items():
+    by_cause = {(stage.value, cause.value): figures.Tally() for stage in StageName for cause in Cause}
+    by_cause |= _grouped(attempts, lambda kind: (kind.stage.value, kind.cause) if kind.cause else None)
+    for labels, tally in by_cause.items():
         failures.add_metric(labels, tally.count)
     return [ended, retries, failures, wasted, cached]
 
@@ -220,9 +262,12 @@ _ENDS_OF_STAGES = (Outcome.DONE, Outcome.FAILED, Outcome.CANCELLED)
 
 def _states(session: Session, attempts: dict[figures.Kind, figures.Tally]) -> list[Metric]:
     families: list[Metric] = []
+    projects = figures.projects(session)
     for name, kind in (("jobs", JobRow), ("trainings", TrainingRow)):
         family = GaugeMetricFamily(f"l3ps_{name}", f"{name.title()} by state.", labels=["project", "state"])
-        for (project, state), count in figures.job_states(session, kind).items():
+        counted = figures.job_states(session, kind)
+        every = {(project, state): counted.get((project, state), 0) for project in projects for state in JobState}
+        for (project, state), count in every.items():
             family.add_metric([project, state.value], count)
         families.append(family)
     stages = GaugeMetricFamily("l3ps_stages", "Stages by name and state.", labels=["stage", "state"])
@@ -238,7 +283,10 @@ def _states(session: Session, attempts: dict[figures.Kind, figures.Tally]) -> li
     uploads = GaugeMetricFamily("l3ps_uploads", "Uploads by state.", labels=["state"])
     for upload_state, count in figures.upload_states(session).items():
         uploads.add_metric([upload_state.value], count)
-    return [*families, stages, uploads]
+    messages = GaugeMetricFamily("l3ps_webhook_deliveries", "Messages to webhooks by state.", labels=["state"])
+    for delivery_state, count in figures.delivery_states(session).items():
+        messages.add_metric([delivery_state.value], count)
+    return [*families, stages, uploads, messages]
 
 
 def _queues(session: Session, now: datetime) -> list[Metric]:

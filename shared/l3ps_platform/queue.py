@@ -7,7 +7,7 @@ catalog decides. So the queue may lose, delay and repeat messages, and no result
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, cast
 
 import redis
@@ -24,6 +24,9 @@ from l3ps_platform.settings import Settings
 
 TASK_NAMES = {name: f"l3ps.{name.value}" for name in StageName}
 """Which Celery task does which stage."""
+
+_UNACKED, _UNACKED_INDEX = "unacked", "unacked_index"
+"""Where kombu keeps the messages that were delivered and not acknowledged."""
 
 
 def make_app(settings: Settings) -> Celery:
@@ -113,6 +116,23 @@ class Queue:
             raw = cast("list[bytes]", self._redis.lrange(queue.value, 0, -1))
         return {pair for message in raw if (pair := _identity(message)) is not None}
 
+    def delivered(self) -> dict[str, tuple[str, int]]:
+        """The (stage id, attempt) of every message that a worker took and has not acknowledged, by its tag.
+
+        Those of a worker that was killed stay until they are delivered again.
+        """
+        with _RedisErrors():
+            raw = cast("dict[bytes, bytes]", self._redis.hgetall(_UNACKED))
+        found = {tag.decode(): _identity(entry) for tag, entry in raw.items()}
+        return {tag: pair for tag, pair in found.items() if pair is not None}
+
+    def drop(self, tags: Collection[str]) -> None:
+        """Forget messages of :meth:`delivered`; a worker that acknowledges one later does no harm."""
+        with _RedisErrors(), self._redis.pipeline() as pipe:
+            pipe.zrem(_UNACKED_INDEX, *tags)
+            pipe.hdel(_UNACKED, *tags)
+            pipe.execute()
+
     def ping(self) -> None:
         """Raise QueueUnavailable unless Redis answers."""
         with _RedisErrors():
@@ -134,8 +154,11 @@ class _RedisErrors:
 
 
 def _identity(message: bytes) -> tuple[str, int] | None:
+    """Of a message as it lies in a queue, or with where it came from among the delivered ones."""
     try:
-        stage_id, _, attempt = json.loads(message)["headers"]["id"].rpartition(":")
+        found = json.loads(message)
+        content = found[0] if isinstance(found, list) else found
+        stage_id, _, attempt = content["headers"]["id"].rpartition(":")
         return stage_id, int(attempt)
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError):
         return None  # not one of ours

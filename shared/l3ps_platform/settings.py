@@ -21,7 +21,7 @@ GiB = 1024 * MiB
 class S3Location(BaseModel):
     """An S3 bucket as named by ``s3://KEY:SECRET@host:port/bucket?secure=0&region=…``."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, hide_input_in_errors=True)
 
     endpoint: str
     bucket: str
@@ -57,14 +57,14 @@ class Settings(BaseSettings):
     """
 
     # Values of settings hold secrets, so errors do not repeat them.
-    model_config = SettingsConfigDict(
-        env_prefix="L3PS_", extra="ignore", hide_input_in_errors=True
-    )  # URLs hold secrets
+    model_config = SettingsConfigDict(env_prefix="L3PS_", extra="ignore", hide_input_in_errors=True)
 
     data_dir: Path = Field(default_factory=lambda: Path.home() / ".local" / "share" / "l3ps")
-    database_url: str = ""  # empty: SQLite in data_dir
-    redis_url: str = "redis://127.0.0.1:6379/0"  # or unix:///path/redis.sock
-    objects_url: str = ""  # file:///DIR or s3://KEY:SECRET@host:port/bucket?secure=0; empty: data_dir/objects
+    # These three may hold a password: they are left out of the settings' repr, and their values out of errors.
+    database_url: str = Field(default="", repr=False)  # empty: SQLite in data_dir
+    redis_url: str = Field(default="redis://127.0.0.1:6379/0", repr=False)  # or unix:///path/redis.sock
+    # file:///DIR or s3://KEY:SECRET@host:port/bucket?secure=0; empty: data_dir/objects
+    objects_url: str = Field(default="", repr=False)
     # Where clients reach the S3 server, if not where the services reach it (inside compose: minio:9000, outside:
     # localhost:9000). A signature covers the host name, so it cannot be rewritten later. scheme://host:port
     objects_public_url: str | None = None
@@ -131,6 +131,10 @@ class Settings(BaseSettings):
     resend_seconds: float = 30.0
     # A process that has not stopped this long after its job was cancelled is deep in compiled code, and is killed.
     cancel_seconds: float = 10.0
+    # How long what nothing refers to stays in the store: half-made objects of dead processes, checkpoints of trainings
+    # that failed. Long enough to look into a failure, and to go on with a training.
+    orphan_seconds: float = 24 * 3600.0
+    orphans_every_seconds: float = 3600.0  # how often the whole store is looked through for them
     # Beyond this a stage is taken to hang: its process is killed and the attempt counts as failed.
     stage_seconds: float = 4 * 3600.0
     # The same for a training; the next attempt goes on from its last checkpoint. Below the day after which Redis
@@ -159,7 +163,7 @@ class Settings(BaseSettings):
     checkpoint_seconds: float = 30.0  # how often a training's checkpoint and log go to the object store
 
     event_days: float = Field(default=30.0, gt=0)  # the event log and finished deliveries are kept for so long
-    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; one costs about 50 kB
+    event_streams: int = Field(default=500, gt=0)  # open at once in an API process; 200 took 120 kB each
     # Networks that webhooks may reach though they are not public, e.g. 10.1.0.0/16,127.0.0.1/32; else a client could
     # have the service call into its own network.
     webhook_allow: Annotated[tuple[IPv4Network | IPv6Network, ...], NoDecode] = ()

@@ -1,26 +1,32 @@
 """Logs: one JSON object a line (or coloured text on a terminal), each with the ids of what is being worked on.
 
 Log with ``structlog.get_logger(__name__).info("stage done", points=n)``; ids bound with :func:`bound` appear in every
-line of the thread or request, also in lines of libraries that use the standard ``logging``.
+line of the thread or request, also in lines of libraries that use the standard ``logging``. Warnings and what nobody
+catches are logged too, and secrets are left out of every line (:mod:`l3ps_platform.redaction`).
 """
 
 from __future__ import annotations
 
+import json
 import logging
-import re
+import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from datetime import UTC, datetime
+from types import TracebackType
 
 import structlog
 
+from l3ps_platform.redaction import Redactor
 from l3ps_platform.settings import Settings
 
 # Chatty below WARNING, and nothing in it that our own lines do not say.
-_QUIET = ("urllib3", "kombu", "amqp", "celery.redirected", "alembic", "httpx", "httpcore")
-
-_SECRET = re.compile(r"(l3ps_key_[0-9a-z]{25}_)[A-Za-z0-9_-]{43}")
+_QUIET = (
+    *("urllib3", "kombu", "amqp", "celery.redirected", "alembic", "httpx", "httpcore"),
+    *("celery.worker.strategy", "celery.app.trace"),
+)
 
 
 def configure_logging(settings: Settings, service: str) -> None:
@@ -51,7 +57,7 @@ def configure_logging(settings: Settings, service: str) -> None:
         last += [
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
         ]
-    last.append(_without_secrets)
+    last.append(_redacting(Redactor(settings)))
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=last))
     root = logging.getLogger()
@@ -59,6 +65,9 @@ def configure_logging(settings: Settings, service: str) -> None:
     root.setLevel(settings.log_level)
     for name in _QUIET:
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
+    logging.captureWarnings(True)
+    sys.excepthook = _uncaught
+    threading.excepthook = _uncaught_in_thread
 
 
 @contextmanager
@@ -68,14 +77,37 @@ def bound(**ids: str | int | None) -> Iterator[None]:
         yield
 
 
-def _without_secrets(_: object, __: str, line: Any) -> str:
-    """Leave the secret out of an API key, wherever a client has put one; the key's id stays."""
-    return _SECRET.sub(r"\1…", str(line))
+def line(service: str, event: str) -> bytes:
+    """A line in the form of the others, for where logging is not to be had: in a signal handler."""
+    now = datetime.now(UTC).isoformat().replace("+00:00", "Z")
+    said = {"event": event, "level": "info", "timestamp": now, "service": service, "pid": os.getpid()}
+    return (json.dumps(said, ensure_ascii=False) + "\n").encode()
 
 
 def _naming(service: str) -> structlog.types.Processor:
     def name(_: object, __: str, event: structlog.types.EventDict) -> structlog.types.EventDict:
         event.setdefault("service", service)
+        event.setdefault("pid", os.getpid())
         return event
 
     return name
+
+
+def _redacting(redact: Redactor) -> structlog.types.Processor:
+    def leave_out(_: object, __: str, rendered: object) -> str:
+        return redact(str(rendered))
+
+    return leave_out
+
+
+def _uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        return
+    logging.getLogger("uncaught").critical("the process ends with an exception", exc_info=(kind, error, trace))
+
+
+def _uncaught_in_thread(failed: threading.ExceptHookArgs) -> None:
+    if failed.exc_value is not None and not isinstance(failed.exc_value, SystemExit):
+        info = (failed.exc_type, failed.exc_value, failed.exc_traceback)
+        name = failed.thread.name if failed.thread is not None else "?"
+        logging.getLogger("uncaught").error("a thread ends with an exception: %s", name, exc_info=info)

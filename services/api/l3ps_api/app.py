@@ -10,9 +10,10 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector
 
 from l3ps_api import errors
+from l3ps_api.access_log import AccessLog
 from l3ps_api.annotation_sets.routes import router as annotation_sets
 from l3ps_api.auth import Gate, authenticate
 from l3ps_api.description import describe
@@ -32,17 +33,19 @@ from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.projects.routes import router as projects
+from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
 from l3ps_api.system.routes import router as system
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
+from l3ps_api.webhooks import service as webhook_service
 from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import StoreUnavailable
-from l3ps_platform.metrics import CatalogCollector
+from l3ps_platform.metrics import CatalogCollector, DiskCollector
 from l3ps_platform.objects import open_store, parse_sources
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
@@ -56,7 +59,7 @@ Drive logs in, panoptic labels on every LiDAR point out.
 
 1. `POST /v1/uploads` announces an archive; `PUT` its parts to the URLs answered; `POST …/complete` makes it a drive.
 2. `POST /v1/jobs` labels a drive with a model; `GET /v1/jobs/{id}` shows progress, cost and quality.
-3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs.
+3. `GET /v1/jobs/{id}/labels` lists the label files with presigned URLs; `…/labels.tar` is all of them in one.
 
 A model comes as an upload of kind `model`, or from `POST /v1/models/train` with an upload of kind `annotations`;
 `GET /v1/trainings/{id}` shows progress, log and report.
@@ -82,17 +85,24 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.events = EventHub(catalog)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
+    app.state.registry.register(DiskCollector(settings))
+    ProcessCollector(registry=app.state.registry)
+    streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
+    streams.set_function(lambda: app.state.events.listeners)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
-    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, rules, notifications)
+    resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention, rules, notifications)
     for router in (*resources, events, webhooks, keys, projects):
         app.include_router(router, dependencies=guarded)
     errors.install(app)
     # The last added is the first to see a request.
     app.add_middleware(
         Idempotency, services=services, operations=lambda: operations_of(app),
-        remade={"uploads": upload_service.opened, "api_keys": key_service.shown_again},
+        remade={
+            "uploads": upload_service.opened, "api_keys": key_service.shown_again,
+            "webhooks": webhook_service.shown_again,
+        },
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
@@ -103,6 +113,7 @@ def create_app(settings: Settings) -> FastAPI:
     if not settings.loopback and settings.token is None:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
+    app.add_middleware(AccessLog)
     describe(app)
     return app
 

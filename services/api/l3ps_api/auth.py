@@ -6,11 +6,10 @@ from collections.abc import Callable
 from typing import Annotated
 from urllib.parse import parse_qsl
 
-import structlog
 from fastapi import Depends, Request, Security
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from l3ps_api.keyring import Keyring, Principal
 from l3ps_api.keyring import Scope as KeyScope
@@ -21,8 +20,6 @@ from l3ps_api.replies import header
 from l3ps_platform.errors import NotFound
 from l3ps_platform.settings import Settings
 from l3ps_platform.telemetry import bound
-
-log = structlog.get_logger(__name__)
 
 PROJECT_HEADER = "L3PS-Project"
 _ADMIN = ("keys", "webhooks", "rules", "retention", "projects")
@@ -87,10 +84,7 @@ class Gate:
             _check_query(operation, scope["query_string"])
         scope.setdefault("state", {})["principal"] = principal
         with bound(project=principal.project_id, key=principal.key_id):
-            if scope["method"] in _READING:
-                await self.app(scope, receive, send)
-            else:
-                await self._noted(scope, receive, send)
+            await self.app(scope, receive, send)
 
     async def _caller(self, scope: Scope) -> Principal:
         secret, project = _bearer_secret(scope), header(scope["headers"], b"l3ps-project") or ""
@@ -112,16 +106,6 @@ class Gate:
                 self._failures.take(address)
             raise _unauthorized("the bearer token is missing" if secret is None else "the credentials are not valid")
         return found
-
-    async def _noted(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve what may change something, and log that it was asked: who did what."""
-
-        async def observed(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                log.info("request", method=scope["method"], path=scope["path"], status=message["status"])
-            await send(message)
-
-        await self.app(scope, receive, observed)
 
 
 def scope_needed(method: str, path: str) -> KeyScope:

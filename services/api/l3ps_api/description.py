@@ -17,6 +17,7 @@ _ERRORS = {
     "409": "Not possible in the present state of things; or a request with this Idempotency-Key is in progress.",
     "412": "The document has another ETag than `If-Match` names.",
     "413": "The body, or the file announced, is too large.",
+    "416": "The document has no such range of bytes.",
     "422": "The request cannot be used; `errors` names the fields at fault.",
     "429": "Too many requests, or a quota is reached; `Retry-After` says when to ask again.",
     "503": "Something the service stands on does not answer; `Retry-After` says when to ask again.",
@@ -82,8 +83,10 @@ def _complete(path: str, method: str, operation: dict[str, Any]) -> None:
         else:
             headers += ["IfMatch"]
             errors |= {"404", "409", "412", "413"}
-        if "{" in path:
+        if "{" in path or not document:
             errors |= {"404", "409"}
+        if "206" in responses:
+            errors |= {"416"}
         if document:
             responses["304"] = {"description": "The client has it already."}
         references = [{"$ref": f"#/components/parameters/{name}"} for name in headers]

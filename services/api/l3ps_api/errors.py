@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from l3ps.errors import InputError
 from l3ps_api.operations import operations_of
-from l3ps_api.problems import ApiProblem, ErrorItem, answer, fault, items, too_large, unavailable, unknown
+from l3ps_api.problems import ApiProblem, ErrorItem, answer, fault, invalid, items, too_large, unavailable, unknown
 from l3ps_platform.errors import (
     CatalogUnavailable,
     Conflict,
@@ -104,7 +104,7 @@ def _field_error(fault: dict[str, Any]) -> ErrorItem:
         return ErrorItem(where="body", what="the body is not valid JSON", remedy="Send a JSON object.")
     name = ".".join(names)
     where = name if place == "body" and name else f"{place} {name}".rstrip()
-    what = str(fault["msg"])
+    what = str(fault["msg"]).removeprefix("Value error, ")
     what = what[:1].lower() + what[1:]
     if kind == "missing":
         return ErrorItem(where=where, what="the field is missing", remedy="Add it.")
@@ -129,6 +129,8 @@ def _http_error(request: Request, error: HTTPException) -> ApiProblem:
         headers["Allow"] = allowed = ", ".join(methods)
         what, remedy = f"{request.method} does not work on {path}", f"It takes {allowed}."
         return fault(status, code, status.phrase, "method", what, remedy, headers)
+    if status == HTTPStatus.BAD_REQUEST:  # FastAPI's word for a body that is no UTF-8
+        return invalid("body", "the body is not valid JSON", "Send a JSON object.")
     if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:
         what, _, remedy = str(error.detail).partition(". ")
         return too_large("body", what, remedy)
@@ -175,6 +177,13 @@ def _parted(error: Exception, remedy: str) -> tuple[str, str]:
     return what, f"{given[:1].upper()}{given[1:].rstrip('.')}." if given else remedy
 
 
+def _unkept(_: Request, error: sqlalchemy.exc.DataError) -> ApiProblem:
+    # An id or cursor with a NUL, for one: PostgreSQL refuses to look for it where SQLite finds nothing.
+    log.info("refused by the database", reason=str(error.orig))
+    what = "it holds a character or a number that no row can hold"
+    return invalid("request", what, "Look at its path and query for NUL characters and numbers beyond 64 bits.")
+
+
 _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]], ...] = (
     (ApiProblem, _as_is),
     (RequestValidationError, _invalid_request),
@@ -189,5 +198,6 @@ _TRANSLATIONS: tuple[tuple[type[Exception], Callable[[Request, Any], ApiProblem]
     (StoreUnavailable, _down("object store")),
     (QueueUnavailable, _down("queue")),
     (CatalogUnavailable, _down("catalog")),
+    (sqlalchemy.exc.DataError, _unkept),
     (sqlalchemy.exc.TimeoutError, _down("catalog")),  # no free connection
 )

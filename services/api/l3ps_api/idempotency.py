@@ -61,7 +61,7 @@ class Idempotency:
             return  # the client has gone in the middle of its request
         services = replace(self._services, catalog=self._services.catalog.scoped(principal.project_id))
         try:
-            state = await run_in_threadpool(self._begin, services, key, _fingerprint(scope, body))
+            state = await run_in_threadpool(self._begin, services, key, fingerprint(scope, body))
         except requests.OtherRequest:
             raise _refused(422, "idempotency-key-reused", "it was used for another request", "Use a new key.") from None
         if isinstance(state, requests.Busy):
@@ -74,7 +74,7 @@ class Idempotency:
             reply = await self._done(scope, services, state, body, receive, send)
         await reply.send(send)
 
-    def _begin(self, services: Services, key: str, fingerprint: str) -> requests.Held | requests.Kept | requests.Busy:
+    def _begin(self, services: Services, key: str, asked: str) -> requests.Held | requests.Kept | requests.Busy:
         settings = services.settings
         seconds = {
             "lease_seconds": settings.idempotency_lease_seconds, "keep_seconds": settings.idempotency_seconds
@@ -84,7 +84,7 @@ class Idempotency:
             with self._services.catalog.transaction() as tx:
                 requests.purge(tx)
         with services.catalog.transaction() as tx:
-            return requests.begin(tx, key, fingerprint, **seconds)
+            return requests.begin(tx, key, asked, **seconds)
 
     async def _kept(self, scope: Scope, services: Services, kept: requests.Kept) -> Reply:
         headers = [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.headers.items()]
@@ -154,7 +154,8 @@ def _usable(given: list[bytes]) -> str:
     return key
 
 
-def _fingerprint(scope: Scope, body: bytes) -> str:
+def fingerprint(scope: Scope, body: bytes) -> str:
+    """SHA-256 of what a request asks for: path, query and body."""
     found = hashlib.sha256(scope.get("raw_path", scope["path"].encode()) + b"?" + scope["query_string"] + b"\n")
     found.update(body)
     return found.hexdigest()

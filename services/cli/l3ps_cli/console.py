@@ -10,7 +10,7 @@ import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
 
-from l3ps_cli.errors import BAD_INPUT, OK, UNREACHABLE, clear_errors, err, fail, out
+from l3ps_cli.errors import BAD_INPUT, INTERRUPTED, OK, UNREACHABLE, clear_errors, err, fail, out
 from l3ps_cli.errors import FAILED as JOB_FAILED
 from l3ps_client import L3psClientError, Refused, TooManyRequests, Unreachable
 from l3ps_client import Progress as Report
@@ -38,6 +38,8 @@ def service_errors() -> Iterator[None]:
             fail(str(error), UNREACHABLE)
         except Refused as error:
             fail(str(error), BAD_INPUT)
+        except KeyboardInterrupt:
+            fail("Stopped. The same command goes on where this one was.", INTERRUPTED)
         except L3psClientError as error:
             fail(str(error), JOB_FAILED)
 

@@ -57,7 +57,7 @@ def _print(key: Key, as_json: bool) -> None:
         out.print_json(data=key)
         return
     done(f"key {key['id']}: {key['name']}, {key['scope']}", as_json=False)
-    done(key.get("secret", ""), as_json=False)
+    done(key.get("secret") or "", as_json=False)
 
 
 COLUMNS = {

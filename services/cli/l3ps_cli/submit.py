@@ -22,7 +22,7 @@ Kind = Literal["drive", "annotations"]
 
 
 def submit(
-    log: Annotated[Path, typer.Argument(help="Drive log: a directory or an archive.")],
+    log: Annotated[str, typer.Argument(help="Drive log: a directory, an archive, or s3://bucket/prefix.")],
     *,
     model: Annotated[str, typer.Option(help="Name of a model the service has, or a bundle (directory or zip).")],
     preset: Annotated[str, typer.Option(help="paper, best or fast.")] = "best",
@@ -39,17 +39,19 @@ def submit(
     wait: Annotated[bool, typer.Option("--wait", help="Stay until the job is over, showing its progress.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the job's document.")] = False,
 ) -> None:
-    """Upload a drive log, start a job on it and, with --wait, see it through.
+    """Upload a drive log, start a job on it and, with --wait, see it through; a log in a bucket is not uploaded.
 
     Exit codes: 0 done, 1 the job failed, 2 bad input, 3 the service cannot be reached.
     """
     with service_errors(), Client() as client:
-        check_log(log)
+        by_reference = log.startswith("s3://")
+        if not by_reference:
+            check_log(Path(log))
         _check_settings(preset, segment, formats, protocol)
         model_name = ensure_model(client, model)
-        drive = upload_log(client, log)
         job = client.jobs.create(
-            drive_id=drive["id"],
+            drive_id=None if by_reference else upload_log(client, Path(log))["id"],
+            source=log if by_reference else None,
             model=model_name,
             preset=preset,
             segment=segment,

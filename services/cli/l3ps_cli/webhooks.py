@@ -16,17 +16,19 @@ Webhook = Annotated[str, typer.Argument(help="Id of a webhook.")]
 @app.command()
 def create(
     url: Annotated[str, typer.Argument(help="Where to POST events.")],
-    kind: Annotated[list[str] | None, typer.Option(help="Only this kind of event; may be repeated.")] = None,
+    event: Annotated[
+        list[str] | None, typer.Option(help="Only this kind, such as job.succeeded or job.*; may be repeated.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Have events sent to a URL. The secret to verify them with is shown now and never again."""
     with service_errors(), Client() as client:
-        webhook = client.webhooks.create(url, kinds=kind)
+        webhook = client.webhooks.create(url, events=event or ())
     if as_json:
         out.print_json(data=webhook)
         return
     done(f"webhook {webhook['id']}: {webhook['url']}", as_json=False)
-    done(webhook.get("secret", ""), as_json=False)
+    done(webhook.get("secret") or "", as_json=False)
 
 
 @app.command("list")
@@ -65,31 +67,33 @@ def deliveries(webhook: Webhook, limit: Limit = 20, as_json: AsJson = False) -> 
 def replay(
     webhook: Webhook,
     delivery: Annotated[str | None, typer.Option(help="Send this delivery again.")] = None,
-    since: Annotated[str | None, typer.Option(help="Send all since this time (ISO 8601) again.")] = None,
+    since: Annotated[str | None, typer.Option(help="Send what failed since this time (ISO 8601) again.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Send one delivery again, or all since a time."""
+    """Send one delivery again, or all that failed since a time."""
     if (delivery is None) == (since is None):
         raise typer.BadParameter("name either --delivery or --since")
     with service_errors(), Client() as client:
         if delivery is not None:
-            answer = client.webhooks.redeliver(webhook, delivery)
+            client.webhooks.redeliver(webhook, delivery)
+            count = 1
         else:
-            answer = client.webhooks.replay(webhook, since=since or "")
-    done("On their way again.", answer, as_json=as_json)
+            count = client.webhooks.replay(webhook, since=since or "")
+    done(f"{count} on the way again.", {"count": count}, as_json=as_json)
 
 
 COLUMNS = {
     "webhook": lambda webhook: webhook["id"],
     "url": lambda webhook: webhook["url"],
-    "kinds": lambda webhook: ", ".join(webhook.get("kinds") or ["all"]),
-    "state": lambda webhook: state(webhook.get("state") or ""),
+    "events": lambda webhook: ", ".join(webhook["events"] or ["all"]),
+    "enabled": lambda webhook: "yes" if webhook["enabled"] else f"no: {webhook['disabled_reason'] or ''}",
     "made": lambda webhook: webhook["created_at"][:19],
 }
 DELIVERIES = {
     "delivery": lambda delivery: delivery["id"],
-    "event": lambda delivery: delivery.get("kind") or "",
-    "state": lambda delivery: state(delivery.get("state") or ""),
-    "tries": lambda delivery: str(delivery.get("attempts") or ""),
-    "status": lambda delivery: str(delivery.get("status") or ""),
+    "event": lambda delivery: delivery["type"],
+    "state": lambda delivery: state(delivery["state"]),
+    "tries": lambda delivery: str(delivery["attempts"]),
+    "status": lambda delivery: str(delivery["last_status"] or ""),
+    "why": lambda delivery: delivery["last_error"] or "",
 }

@@ -29,6 +29,7 @@ from l3ps_platform.errors import PlatformError  # noqa: E402
 from l3ps_platform.processes import die_with, is_child  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
+from l3ps_worker import plain_words  # noqa: E402
 from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
@@ -71,6 +72,9 @@ for _stage, _task_name in TASK_NAMES.items():
     app.task(name=_task_name, time_limit=_seconds)(_run)
 
 
+signals.celeryd_init.connect(plain_words.make_lines, weak=False)
+
+
 @signals.setup_logging.connect  # type: ignore[untyped-decorator]
 def _configure_logging(**_: Any) -> None:
     configure_logging(settings, "worker")
@@ -104,8 +108,10 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
     retry = workflow.Retry.of(settings)
     with _briefly() as tx:
         for stage_id, owner in stages.owned(tx.session, owner_prefix(_main_pid)):
-            # Given back before the child died, the stage may be in the hands of another one by now.
-            if stage_id == args[0] and not is_child(int(owner.rpartition(":")[2]), _main_pid):
+            # Given back before the child died, the stage may be in the hands of another one by now. A child beyond
+            # the time limit is reported first and then killed.
+            dead = isinstance(exception, TimeLimitExceeded) or not is_child(int(owner.rpartition(":")[2]), _main_pid)
+            if stage_id == args[0] and dead:
                 workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner, reason=reason, cause=cause)
 
 

@@ -12,7 +12,7 @@ from l3ps.drivelog import ArchiveMember, UnpackLimits, gather, unpack
 from l3ps.errors import InputError, Problem, ProcessingError
 from l3ps.progress import Progress
 from l3ps_platform.catalog import DriveRow
-from l3ps_platform.errors import ObjectMissing
+from l3ps_platform.errors import ObjectMissing, StoreUnavailable
 from l3ps_platform.objects import ObjectInfo, Reference, SourceStore, find_source
 from l3ps_platform.settings import Settings
 from l3ps_worker.context import Context
@@ -69,7 +69,9 @@ def fetch(context: Context, row: DriveRow, folder: Path, progress: Progress) -> 
 def fetch_again(context: Context, row: DriveRow, target: Path, folder: Path, progress: Progress) -> None:
     """Fetch a checked drive once more and make its folder. ProcessingError when it is not what was checked."""
     if row.source is None:
-        fetch(context, row, folder, progress).unpack_to(target, context, row.filename, progress)
+        upload = fetch(context, row, folder, progress)
+        as_checked(upload.sha256, row.sha256)
+        upload.unpack_to(target, context, row.filename, progress)
         return
     gone = f"the log at {row.source} has changed since it was checked: start a new job on it"
     try:
@@ -150,6 +152,12 @@ def download(context: Context, key: str | None, path: Path, size: int, progress:
     except ObjectMissing:
         raise ProcessingError("the uploaded archive is no longer in the store: upload it again") from None
     return digest.hexdigest()
+
+
+def as_checked(found: str, known: str | None) -> None:
+    """StoreUnavailable for an object that was checked and now reads otherwise: that is no fault of the upload."""
+    if found != known:
+        raise StoreUnavailable(f"the object store gave other bytes than were checked: sha256 {found[:12]}…")
 
 
 def check_sha256(claimed: str | None, found: str, filename: str) -> None:

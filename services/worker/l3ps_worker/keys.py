@@ -24,6 +24,7 @@ from l3ps_worker.trainer import TRAINER
 _ROOT = Path(l3ps.__path__[0])
 _SEGMENTATION = ("segment", "drivelog", "project.py", "geometry.py", "taxonomy.py", "pipeline.py", "labels/types.py")
 _BUNDLE = ("segment", "taxonomy.py")
+_LAYOUT = 2  # of scene.json: raised when it tells more than before, so that older ones are not taken for it
 _NOT_METHOD = ("simulate", "errors.py", "progress.py", "costs.py")
 
 
@@ -58,6 +59,7 @@ def refine_key(
     return _key(
         "refine",
         primal_key.split("/")[1],
+        layout=_LAYOUT,
         **chunks,
         primal=primal_key,
         preset=preset.as_dict(),

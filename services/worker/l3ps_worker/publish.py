@@ -36,7 +36,7 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
             if file["path"] in joined:
                 joined[file["path"]] += context.store.get_bytes(file["key"])
             else:
-                files.append(file)
+                files.append({**file, "scene": scene.name})
         judged[scene.name] = {key: scene_manifest.get(key, []) for key in ("estimates", "warnings")}
         progress("publish", done, len(finished))
     for path, data in joined.items():

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,23 @@ from l3ps_platform.objects import segment as key_segment
 from l3ps_worker.arrays import read_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import refine_key
+from l3ps_worker.outputs import pin
 from l3ps_worker.segment import primal_key
-from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work
+from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work, sha256_of
 
 log = structlog.get_logger(__name__)
 
 STEPS = (*REFINE_STAGES, "write", "evaluate", "store")
 SCENE_MANIFEST = "scene.json"
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenFile:
+    """A file, and the format and scan it belongs to; None for those of every format, or of several scans."""
+
+    path: Path
+    format: str | None = None
+    scan: str | None = None
 
 
 def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
@@ -44,6 +54,7 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     wanted = work.job.settings
     prefix = refine_key(primal_key(work), work.preset, wanted["formats"], wanted["protocol"], max_points)
     manifest_key = f"{prefix}/{SCENE_MANIFEST}"
+    pin(context, claim, prefix, progress)
     try:
         stored: Json = json.loads(context.store.get_bytes(manifest_key))
         return _done(manifest_key, stored, work, cached=True)
@@ -96,6 +107,7 @@ def _done(
 
     def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
         workflow.complete(tx, claim, cost, output_key=key, quality=quality)
+        workflow.note_output(tx, key.rpartition("/")[0], sum(file["size"] for file in manifest["files"]))
 
     stored = sum(file["size"] for file in manifest["files"])
     return Done(finish, work.scene.scans, work.scene.points, stored, cached=cached, steps=steps or {})
@@ -116,14 +128,16 @@ def _write(
     sides: dict[str, list[ScanLabels]],
     poses: NDArray[np.float64],
     progress: Progress,
-) -> list[tuple[Path, str | None]]:
-    """Write all files below ``out``; each with the format it belongs to, None for those of every format."""
-    files: list[tuple[Path, str | None]] = []
+) -> list[WrittenFile]:
+    """Write all files below ``out``."""
+    files: list[WrittenFile] = []
     tasks = [(side, format) for side in sides for format in formats]
     for done, (side, format) in enumerate(tasks, start=1):
-        files += [(path, format) for path in write_scene(out / side, format, scene, sides[side])]  # type: ignore[arg-type]
+        written = write_scene(out / side, format, scene, sides[side])  # type: ignore[arg-type]
+        each = max(1, len(written) // max(1, len(sides[side])))  # in the order of the scans, as many for each
+        files += [WrittenFile(path, format, sides[side][at // each].token) for at, path in enumerate(written)]
         progress("write", done, len(tasks))
-    files += [(path, None) for path in write_poses(out, [(scene, poses)])]
+    files += [WrittenFile(path) for path in write_poses(out, [(scene, poses)])]
     return files
 
 
@@ -140,22 +154,20 @@ def _evaluate(
     return states
 
 
-def _store(
-    context: Context, prefix: str, out: Path, files: Sequence[tuple[Path, str | None]], progress: Progress
-) -> list[Json]:
+def _store(context: Context, prefix: str, out: Path, files: Sequence[WrittenFile], progress: Progress) -> list[Json]:
     entries: list[Json] = []
-    for done, (path, format) in enumerate(files, start=1):
+    for done, file in enumerate(files, start=1):
+        path = file.path
         relative = path.relative_to(out)
         key = "/".join([prefix, *map(key_segment, relative.parts)])
         context.store.put_file(key, path)
-        with path.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         entries.append(
             {
                 "path": relative.as_posix(),
-                "format": format,
+                "format": file.format,
+                "scan": file.scan,
                 "size": path.stat().st_size,
-                "sha256": sha256,
+                "sha256": sha256_of(path),
                 "key": key,
             }
         )

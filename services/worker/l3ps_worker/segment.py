@@ -9,6 +9,7 @@ from l3ps_platform import workflow
 from l3ps_worker.arrays import write_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import segment_key
+from l3ps_worker.outputs import pin
 from l3ps_worker.work import Done, SceneWork, model_file, opened_scene, scene_work
 
 
@@ -16,10 +17,16 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     """Compute and store the primal labels, unless the same ones are there already."""
     work = scene_work(context, claim)
     key = primal_key(work)
+    prefix = key.rpartition("/")[0]
+
+    size: int | None = None
 
     def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
         workflow.complete(tx, claim, cost, output_key=key)
+        if size is not None:
+            workflow.note_output(tx, prefix, size)
 
+    pin(context, claim, prefix, progress)
     if context.store.exists(key):
         return Done(finish, work.scene.scans, work.scene.points, cached=True)
     book = CostBook()
@@ -31,6 +38,7 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
             labels = primal_labels(scene, segmenter, progress)
         write_labels(folder / "primal.npz", labels)
         context.store.put_file(key, folder / "primal.npz")
+        size = (folder / "primal.npz").stat().st_size
     steps = {name: (cost.seconds, cost.peak_mb) for name, cost in book.stages.items()}
     return Done(finish, len(labels), sum(len(scan.semantic) for scan in labels), steps=steps)
 

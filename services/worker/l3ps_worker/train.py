@@ -19,6 +19,7 @@ from l3ps_worker.context import Context
 from l3ps_worker.fetching import check_sha256, download, unpack_limits
 from l3ps_worker.ingest import check_model
 from l3ps_worker.keys import train_key
+from l3ps_worker.outputs import pin
 from l3ps_worker.trainer import children_cpu_seconds
 from l3ps_worker.training import OUT, TrainingRun
 from l3ps_worker.work import Done, sha256_of
@@ -53,6 +54,7 @@ def train(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
             context, claim, progress, row, folder=folder, inputs=inputs, checkpoint_key=f"{prefix}/checkpoint.pt"
         )
         key, archive = f"{prefix}/bundle.zip", folder / "bundle.zip"
+        pin(context, claim, prefix, progress)
         cached = context.store.exists(key)
         if cached:
             context.store.get_file(key, archive)
@@ -70,10 +72,13 @@ def train(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
             report = json.loads(bundle.read("report.json"))
         size, sha256 = archive.stat().st_size, sha256_of(archive)
     info["name"] = row.name
+
+    def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
+        workflow.training_done(tx, claim, cost, object_key=key, size=size, sha256=sha256, info=info, report=report)
+        workflow.note_output(tx, prefix, size)
+
     return Done(
-        lambda tx, claim, cost: workflow.training_done(
-            tx, claim, cost, object_key=key, size=size, sha256=sha256, info=info, report=report
-        ),
+        finish,
         cached=cached,
         steps=run.steps,
         child_cpu_seconds=children_cpu_seconds() - cpu_seconds,

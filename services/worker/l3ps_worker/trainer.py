@@ -18,8 +18,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+import structlog
+
 from l3ps.errors import L3psError
 from l3ps_platform.processes import Child, spawn
+
+log = structlog.get_logger(__name__)
 
 TRAINER = "l3ps_trainer"
 LOG_BYTES = 256 << 10
@@ -74,7 +78,7 @@ class Trainer:
     def __init__(self, child: Child, events: IO[bytes], log: IO[bytes], kept: Log) -> None:
         self.child = child
         self._kept = kept
-        self._line = bytearray()
+        self._line, self._said = bytearray(), bytearray()
         self._selector = selectors.DefaultSelector()
         for source, take in ((events, self._take_events), (log, self._take_log)):
             os.set_blocking(source.fileno(), False)
@@ -126,6 +130,10 @@ class Trainer:
 
     def _take_log(self, data: bytes) -> list[Event]:
         self._kept.write(data)
+        self._said += data
+        *lines, self._said = self._said.split(b"\n")
+        for said in lines:
+            log.info("trainer", line=said.decode(errors="replace")[:1000], trainer=self.child.pid)
         return []
 
     def _take_events(self, data: bytes) -> list[Event]:

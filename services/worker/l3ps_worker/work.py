@@ -16,7 +16,7 @@ from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
 from l3ps_worker.context import Context
-from l3ps_worker.fetching import download, fetch_again
+from l3ps_worker.fetching import as_checked, download, fetch_again
 
 Finish = Callable[[Transaction, workflow.Claim, workflow.Cost], None]
 
@@ -119,7 +119,7 @@ def model_file(context: Context, model: ModelRow, progress: Progress) -> Iterato
     assert model.sha256 is not None
 
     def make(target: Path) -> None:
-        download(context, model.object_key, target, model.size, progress)
+        as_checked(download(context, model.object_key, target, model.size, progress), model.sha256)
 
     with context.scratch.entry(f"model-{model.sha256}", make) as path:
         yield path

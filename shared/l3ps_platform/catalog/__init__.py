@@ -2,22 +2,25 @@
 
 Rows and states live here, queries only in the modules named after what they fetch: ``uploads``, ``drives``,
 ``bundles`` (models), ``annotation_sets``, ``jobs``, ``rules`` (and what arrived), ``trainings``, ``stages``,
-``figures`` (sums for the metrics), ``projects``, ``keys``, ``requests`` (POSTs that may be repeated), ``quotas``,
-``events`` (the log, which a transaction writes through ``outbox``), ``webhooks``. What changes states is in
-:mod:`l3ps_platform.workflow`.
+``outputs``, ``retention``, ``belongings`` (whose an object is), ``figures`` (sums for the metrics), ``projects``,
+``keys``, ``requests`` (POSTs that may be repeated), ``quotas``, ``events`` (the log, which a transaction writes through
+``outbox``), ``webhooks``. What changes states is in :mod:`l3ps_platform.workflow`.
 """
 
 from l3ps_platform.catalog import (
     annotation_sets,
+    belongings,
     bundles,
     drives,
     events,
     figures,
     jobs,
     keys,
+    outputs,
     projects,
     quotas,
     requests,
+    retention,
     rules,
     stages,
     trainings,
@@ -42,6 +45,7 @@ from l3ps_platform.catalog.models import (
     TrainingRow,
     UploadRow,
 )
+from l3ps_platform.catalog.output_rows import OutputRow, OutputUseRow, RetentionRow
 from l3ps_platform.catalog.session import Catalog, Sender, StageMessage, Transaction
 from l3ps_platform.catalog.source_rows import ArrivalRow, RuleRow
 from l3ps_platform.catalog.states import (
@@ -50,6 +54,7 @@ from l3ps_platform.catalog.states import (
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -78,10 +83,14 @@ __all__ = [
     "ModelRow",
     "ModelState",
     "Outcome",
+    "OutputRow",
+    "OutputState",
+    "OutputUseRow",
     "Owned",
     "ProjectRow",
     "QueueName",
     "RequestRow",
+    "RetentionRow",
     "RuleRow",
     "SceneRow",
     "Sender",
@@ -96,15 +105,18 @@ __all__ = [
     "UploadState",
     "WebhookRow",
     "annotation_sets",
+    "belongings",
     "bundles",
     "drives",
     "events",
     "figures",
     "jobs",
     "keys",
+    "outputs",
     "projects",
     "quotas",
     "requests",
+    "retention",
     "rules",
     "stages",
     "trainings",

@@ -15,6 +15,7 @@ from l3ps_platform.catalog.states import (
     DriveState,
     JobState,
     ModelState,
+    OutputState,
     QueueName,
     StageName,
     StageState,
@@ -75,6 +76,7 @@ class Base(DeclarativeBase):
         JobState: _states(JobState),
         StageState: _states(StageState),
         StageName: _states(StageName),
+        OutputState: _states(OutputState),
         QueueName: _states(QueueName),
         DeliveryState: _states(DeliveryState),
     }

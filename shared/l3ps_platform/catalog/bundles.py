@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from sqlalchemy import func, select
+from sqlalchemy import func, or_, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import JobRow, ModelRow, StageRow
 from l3ps_platform.catalog.session import Transaction, project_of
-from l3ps_platform.catalog.states import ModelState
-from l3ps_platform.errors import Conflict
+from l3ps_platform.catalog.states import ACTIVE, ModelState
+from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import new_id
 
 
@@ -98,7 +98,27 @@ def many(session: Session, ids: Iterable[str]) -> dict[str, ModelRow]:
     return queries.many(session, ModelRow, ids)
 
 
+def delete(tx: Transaction, id: str) -> ModelRow:
+    """Hide a model and free its name; labels made with it stay. NotFound, Conflict while a job uses it.
+
+    The reconciler deletes the archive: :func:`leftover_archives`.
+    """
+    row = lock(tx.session, id)
+    if row.deleted_at is not None:
+        raise NotFound("model", id)
+    using = select(JobRow.id).where(JobRow.model_id == id, JobRow.state.in_(ACTIVE)).limit(1)
+    job = tx.session.scalar(using)
+    if job is not None:
+        raise Conflict(f"model {row.name!r} is used by job {job}: cancel it or wait for its end")
+    if row.state not in (ModelState.READY, ModelState.REJECTED):
+        raise Conflict(f"model {row.name!r} is being checked: try again when it is ready")
+    row.deleted_at = tx.now
+    row.name = f"{row.name} (deleted {row.id})"
+    tx.session.flush()
+    return row
+
+
 def leftover_archives(session: Session, limit: int = 100) -> list[ModelRow]:
-    """Rejected models whose archive is still in the store."""
-    query = select(ModelRow).where(ModelRow.state == ModelState.REJECTED, ModelRow.object_key.is_not(None))
-    return list(session.scalars(query.limit(limit)))
+    """Rejected and deleted models whose archive is still in the store."""
+    gone = or_(ModelRow.state == ModelState.REJECTED, ModelRow.deleted_at.is_not(None))
+    return list(session.scalars(select(ModelRow).where(gone, ModelRow.object_key.is_not(None)).limit(limit)))

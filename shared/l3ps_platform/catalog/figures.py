@@ -15,8 +15,17 @@ from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.attempt_rows import AttemptRow, ModelFiguresRow, Outcome
-from l3ps_platform.catalog.models import JobRow, ModelRow, StageRow, StepRow, TrainingRow, UploadRow
-from l3ps_platform.catalog.states import QUEUE_OF, JobState, QueueName, StageName, StageState, UploadState
+from l3ps_platform.catalog.event_rows import DeliveryRow
+from l3ps_platform.catalog.models import JobRow, ModelRow, ProjectRow, StageRow, StepRow, TrainingRow, UploadRow
+from l3ps_platform.catalog.states import (
+    QUEUE_OF,
+    DeliveryState,
+    JobState,
+    QueueName,
+    StageName,
+    StageState,
+    UploadState,
+)
 
 BOUNDS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0)
 """Of the histogram of stages, in seconds. A scene of 40 keyframes refines in seconds to minutes; a drive is checked in
@@ -114,17 +123,27 @@ def open_stages(session: Session) -> dict[tuple[StageName, StageState], int]:
     return {(name, state): int(count) for name, state, count in rows}
 
 
+def projects(session: Session) -> list[str]:
+    """Ids of all projects."""
+    return list(session.scalars(select(ProjectRow.id).order_by(ProjectRow.id)))
+
+
 def job_states(session: Session, kind: type[JobRow] | type[TrainingRow]) -> dict[tuple[str, JobState], int]:
-    """Number of jobs or trainings by project and state, with a zero for states that none of a project's is in."""
+    """Number of jobs or trainings by project and state."""
     query = select(kind.project_id, kind.state, func.count()).group_by(kind.project_id, kind.state)
-    found = {(project_id, state): int(count) for project_id, state, count in session.execute(query)}
-    return {(project_id, state): 0 for project_id, _ in found for state in JobState} | found
+    return {(project_id, state): int(count) for project_id, state, count in session.execute(query)}
 
 
 def upload_states(session: Session) -> dict[UploadState, int]:
     """Number of uploads by state."""
     query = select(UploadRow.state, func.count()).group_by(UploadRow.state)
     return dict.fromkeys(UploadState, 0) | {state: int(count) for state, count in session.execute(query)}
+
+
+def delivery_states(session: Session) -> dict[DeliveryState, int]:
+    """Number of messages to webhooks by state."""
+    query = select(DeliveryRow.state, func.count()).group_by(DeliveryRow.state)
+    return dict.fromkeys(DeliveryState, 0) | {state: int(count) for state, count in session.execute(query)}
 
 
 def expired_leases(session: Session, now: datetime) -> int:

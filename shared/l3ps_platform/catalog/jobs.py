@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from sqlalchemy import ColumnElement, bindparam, case, func, or_, select
@@ -12,8 +12,9 @@ from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, SceneRow, StageRow
+from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageState
-from l3ps_platform.errors import NotFound
+from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import lowest_id
 
 CLOCKS_DIFFER = timedelta(days=1)
@@ -21,12 +22,12 @@ CLOCKS_DIFFER = timedelta(days=1)
 
 
 def get(session: Session, id: str) -> JobRow:
-    """One job. NotFound."""
+    """One job that is not deleted. NotFound."""
     return queries.get(session, JobRow, id)
 
 
 def lock(session: Session, id: str) -> JobRow:
-    """One job, held against concurrent changes until the transaction ends. NotFound."""
+    """One job, deleted or not, held against concurrent changes until the transaction ends. NotFound."""
     return queries.lock(session, JobRow, id)
 
 
@@ -62,12 +63,17 @@ def _conditions(wanted: Wanted) -> list[ColumnElement[bool]]:
         found.append(JobRow.model_id == wanted.model_id)
     # Ids sort by time, and pages are in the order of ids: their bounds are what an index can use.
     if wanted.created_after is not None:
-        found.append(JobRow.created_at >= wanted.created_after)
-        found.append(JobRow.id >= lowest_id("job", wanted.created_after - CLOCKS_DIFFER))
+        after = _storable(wanted.created_after)
+        found += [JobRow.created_at >= after, JobRow.id >= lowest_id("job", after - CLOCKS_DIFFER)]
     if wanted.created_before is not None:
-        found.append(JobRow.created_at < wanted.created_before)
-        found.append(JobRow.id < lowest_id("job", wanted.created_before + CLOCKS_DIFFER))
+        before = _storable(wanted.created_before)
+        found += [JobRow.created_at < before, JobRow.id < lowest_id("job", before + CLOCKS_DIFFER)]
     return found
+
+
+def _storable(moment: datetime) -> datetime:
+    """A moment as far off as anyone may name, brought to where calculating with it does not overflow."""
+    return min(max(moment, datetime(1970, 1, 2, tzinfo=UTC)), datetime(9000, 1, 1, tzinfo=UTC))
 
 
 def revision(session: Session, id: str) -> tuple[Any, ...]:
@@ -95,13 +101,13 @@ _REVISION = (
     .join(DriveRow, DriveRow.id == JobRow.drive_id)
     .join(ModelRow, ModelRow.id == JobRow.model_id)
     .outerjoin(StageRow, or_(StageRow.job_id == JobRow.id, StageRow.drive_id == JobRow.drive_id))
-    .where(JobRow.id == bindparam("job"))
+    .where(JobRow.id == bindparam("job"), JobRow.deleted_at.is_(None))
     .group_by(JobRow.id, DriveRow.id, ModelRow.id)
 )
 
 
 def with_inputs(session: Session, id: str) -> tuple[JobRow, DriveRow, ModelRow]:
-    """One job with its drive and model, deleted or not. NotFound."""
+    """One job that is not deleted, with its drive and model, which may be. NotFound."""
     row = session.execute(_WITH_INPUTS, {"job": id}).one_or_none()
     if row is None:
         raise NotFound(JobRow.noun, id)
@@ -112,7 +118,7 @@ _WITH_INPUTS = (
     select(JobRow, DriveRow, ModelRow)
     .join(DriveRow, DriveRow.id == JobRow.drive_id)
     .join(ModelRow, ModelRow.id == JobRow.model_id)
-    .where(JobRow.id == bindparam("job"))
+    .where(JobRow.id == bindparam("job"), JobRow.deleted_at.is_(None))
 )
 
 
@@ -130,3 +136,21 @@ def unplanned(session: Session, *, drive_id: str | None = None, model_id: str | 
     if model_id is not None:
         query = query.where(JobRow.model_id == model_id)
     return list(session.scalars(query.order_by(JobRow.id).with_for_update()))
+
+
+def delete(tx: Transaction, id: str) -> JobRow:
+    """Hide a finished job, whose labels the reconciler then deletes. NotFound, Conflict while it is not over."""
+    row = lock(tx.session, id)
+    if row.deleted_at is not None:
+        raise NotFound("job", id)
+    if not row.state.final:
+        raise Conflict(f"job {id} is {row.state}: cancel it first, then delete it")
+    row.deleted_at = tx.now
+    tx.session.flush()
+    return row
+
+
+def unswept(session: Session, limit: int = 20) -> list[JobRow]:
+    """Deleted jobs whose labels are still in the store."""
+    query = select(JobRow).where(JobRow.deleted_at.is_not(None), JobRow.swept_at.is_(None))
+    return list(session.scalars(query.order_by(JobRow.deleted_at).limit(limit)))

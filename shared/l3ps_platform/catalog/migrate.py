@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import structlog
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
@@ -20,6 +21,9 @@ from sqlalchemy import Connection, Engine, event, text
 
 from l3ps_platform.catalog.session import make_engine
 from l3ps_platform.settings import get_settings
+from l3ps_platform.telemetry import configure_logging
+
+log = structlog.get_logger(__name__)
 
 _LOCK = 7_335_401  # any constant: API replicas that start together migrate one after the other
 
@@ -92,4 +96,7 @@ def _config(connection: Connection | None = None) -> Config:
 
 
 if __name__ == "__main__":
-    upgrade(get_settings().catalog_url)
+    settings = get_settings()
+    configure_logging(settings, "migrate")
+    upgrade(settings.catalog_url)
+    log.info("the catalog is current")

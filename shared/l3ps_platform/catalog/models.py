@@ -46,6 +46,7 @@ class UploadRow(Owned, Base):
     size: Mapped[int]
     sha256: Mapped[str | None] = mapped_column(String(64))  # the client's claim
     parts: Mapped[int]
+    part_size: Mapped[int]  # of every part but the last; 0 in rows of before this was kept
     state: Mapped[UploadState] = mapped_column(default=UploadState.OPEN)
     object_key: Mapped[str]
     s3_upload_id: Mapped[str]
@@ -99,8 +100,9 @@ class ModelRow(Owned, Base):
     state: Mapped[ModelState] = mapped_column(default=ModelState.UPLOADED)
     problem: Mapped[Json | None]
     info: Mapped[Json | None]
-    object_key: Mapped[str | None]
+    object_key: Mapped[str | None]  # None once the archive is deleted
     created_at: Mapped[datetime]
+    deleted_at: Mapped[datetime | None]
 
 
 class AnnotationsRow(Owned, Base):
@@ -139,6 +141,7 @@ class JobRow(Owned, Base):
         Index(None, "project_id", "state", "id"),
         Index(None, "drive_id", "id"),
         Index(None, "model_id", "id"),
+        Index(None, "deleted_at"),
         # Logs with truth are few; the metrics want the latest of their jobs.
         Index("ix_jobs_with_quality", "id", sqlite_where=_JUDGED, postgresql_where=_JUDGED),
     )
@@ -154,6 +157,8 @@ class JobRow(Owned, Base):
     created_at: Mapped[datetime]
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]  # its labels are deleted; the row stays for the figures
+    swept_at: Mapped[datetime | None]  # and when they had left the store
 
 
 class TrainingRow(Owned, Base):

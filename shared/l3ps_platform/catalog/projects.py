@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from sqlalchemy import ColumnElement, func, select, true
+from sqlalchemy import ColumnElement, func, select
+from sqlalchemy import delete as remove
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import keys
+from l3ps_platform.catalog.base import Owned
+from l3ps_platform.catalog.event_rows import WebhookRow
 from l3ps_platform.catalog.models import (
     DEFAULT_PROJECT,
     AnnotationsRow,
@@ -18,22 +21,17 @@ from l3ps_platform.catalog.models import (
     UploadRow,
 )
 from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.source_rows import RuleRow
 from l3ps_platform.catalog.states import ACTIVE, UploadState
 from l3ps_platform.errors import Conflict, NotFound
 from l3ps_platform.ids import new_id
 
-
-def _there(kind: type[DriveRow | ModelRow | AnnotationsRow]) -> ColumnElement[bool]:
-    deleted_at = getattr(kind, "deleted_at", None)
-    return true() if deleted_at is None else deleted_at.is_(None)
-
-
-_CONTENTS = (
-    ("drives", DriveRow, _there(DriveRow)),
-    ("models", ModelRow, _there(ModelRow)),
-    ("annotations", AnnotationsRow, _there(AnnotationsRow)),
+_CONTENTS: tuple[tuple[str, type[Owned], ColumnElement[bool]], ...] = (
+    ("drives", DriveRow, DriveRow.deleted_at.is_(None)),
+    ("models", ModelRow, ModelRow.deleted_at.is_(None)),
+    ("annotations", AnnotationsRow, AnnotationsRow.deleted_at.is_(None)),
+    ("jobs", JobRow, JobRow.deleted_at.is_(None)),
     ("open uploads", UploadRow, UploadRow.state == UploadState.OPEN),
-    ("unfinished jobs", JobRow, JobRow.state.in_(ACTIVE)),
     ("unfinished trainings", TrainingRow, TrainingRow.state.in_(ACTIVE)),
 )
 """What keeps a project from being deleted."""
@@ -67,7 +65,10 @@ def page(session: Session, *, limit: int, before: str | None = None) -> list[Pro
 
 
 def delete(tx: Transaction, id: str) -> None:
-    """Close an empty project: its keys end and its name becomes free. NotFound; Conflict while it has contents."""
+    """Close an empty project: its keys, rules and webhooks end and its name becomes free.
+
+    NotFound; Conflict while it has contents.
+    """
     query = select(ProjectRow).where(ProjectRow.id == id, ProjectRow.deleted_at.is_(None)).with_for_update()
     row = tx.session.scalars(query).one_or_none()
     if row is None:
@@ -82,5 +83,7 @@ def delete(tx: Transaction, id: str) -> None:
     if left:
         raise Conflict(f"project {id} still has {', '.join(left)}: delete or cancel them first")
     keys.revoke_all(tx, id)
+    for kind in (RuleRow, WebhookRow):
+        tx.session.execute(remove(kind).where(kind.project_id == id))
     row.name, row.deleted_at = f"{row.name[:150]} (deleted {id})", tx.now
     tx.session.flush()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -88,6 +90,42 @@ class Catalog:
         scoped._project = project_id
         return scoped
 
+    def whole(self) -> Catalog:
+        """This catalog with every project's rows, for whoever cleans up."""
+        whole = copy(self)
+        whole._project = None
+        return whole
+
+    @contextmanager
+    def alone(self, what: str) -> Iterator[bool]:
+        """Whether nobody else is at this work now, in any process; held until the block ends or the process dies."""
+        if self.engine.dialect.name == "sqlite":
+            with open(f"{self.engine.url.database}.{what}", "w") as file:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    yield False
+                else:
+                    yield True
+            return
+        # A lock of the session, not of a transaction: no snapshot is held open while the work goes on.
+        with self._connected() as connection:
+            key = {"key": zlib.crc32(what.encode())}
+            mine = bool(connection.execute(text("SELECT pg_try_advisory_lock(:key)"), key).scalar_one())
+            try:
+                yield mine
+            finally:
+                if mine:
+                    connection.execute(text("SELECT pg_advisory_unlock(:key)"), key)
+
+    @contextmanager
+    def _connected(self) -> Iterator[Connection]:
+        try:
+            with self.engine.connect() as connection:
+                yield connection.execution_options(isolation_level="AUTOCOMMIT")
+        except (OperationalError, InterfaceError) as error:
+            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
         """A writing transaction; commits on leaving, rolls back on any exception, then sends the messages.
@@ -169,18 +207,23 @@ def _own_new_rows(session: Session, _context: object, _instances: object) -> Non
             row.project_id = project_of(session, row.project_id)
 
 
+# Connections are opened when they are needed and kept. Beyond a smaller pool they would be closed after each use: five
+# bursts of 200 requests opened 55 connections with 5 kept and 10 more allowed, and 15 so.
+_POOL: dict[str, Any] = {"pool_size": 15, "max_overflow": 0}
+
+
 def make_engine(url: str) -> Engine:
     """An engine with the settings each database needs."""
     parsed = make_url(url)
     if parsed.get_backend_name() == "sqlite":
         if parsed.database:
             Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
-        engine = create_engine(url, connect_args={"timeout": SQLITE_BUSY_MS / 1000})
+        engine = create_engine(url, **_POOL, connect_args={"timeout": SQLITE_BUSY_MS / 1000})
         event.listen(engine, "connect", _on_sqlite_connect)
         event.listen(engine, "begin", _on_sqlite_begin)
         return engine
     # A pooled connection that died with the server is replaced before use instead of failing the first request.
-    return create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args={"connect_timeout": 5})
+    return create_engine(url, pool_pre_ping=True, **_POOL, connect_args={"connect_timeout": 5})
 
 
 def _on_sqlite_connect(connection: sqlite3.Connection, _record: Any) -> None:

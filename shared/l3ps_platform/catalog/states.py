@@ -74,6 +74,13 @@ class DeliveryState(StrEnum):
     FAILED = "failed"
 
 
+class OutputState(StrEnum):
+    """A stage output's life; a doomed one is being deleted."""
+
+    LIVE = "live"
+    DOOMED = "doomed"
+
+
 class StageName(StrEnum):
     """What a stage does."""
 

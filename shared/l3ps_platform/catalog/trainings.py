@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
-from l3ps_platform.catalog.models import TrainingRow
+from l3ps_platform.catalog.models import StageRow, TrainingRow
+from l3ps_platform.catalog.output_rows import OutputUseRow
 from l3ps_platform.catalog.states import ACTIVE, JobState
 
 
@@ -37,3 +40,11 @@ def unfinished(session: Session, name: str) -> TrainingRow | None:
 def of_model(session: Session, model_id: str) -> TrainingRow | None:
     """The training that a model came from, if it came from one."""
     return session.scalars(select(TrainingRow).where(TrainingRow.model_id == model_id).limit(1)).one_or_none()
+
+
+def holding_outputs(session: Session, ended_before: datetime, limit: int = 20) -> list[TrainingRow]:
+    """Trainings that ended before then and still hold their outputs in the store."""
+    query = select(TrainingRow).join(StageRow, StageRow.training_id == TrainingRow.id)
+    query = query.join(OutputUseRow, OutputUseRow.stage_id == StageRow.id)
+    query = query.where(TrainingRow.state.not_in(ACTIVE), TrainingRow.finished_at < ended_before).distinct()
+    return list(session.scalars(query.limit(limit)))

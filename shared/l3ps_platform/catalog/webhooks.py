@@ -87,7 +87,7 @@ def in_flight(session: Session, webhook_ids: Sequence[str], now: datetime) -> di
         DeliveryRow.state == DeliveryState.PENDING,
         DeliveryRow.lease_until >= now,
     )
-    return dict(session.execute(query.group_by(DeliveryRow.webhook_id)).tuples().all())
+    return dict(session.execute(query.group_by(DeliveryRow.webhook_id)).all())
 
 
 def prune_deliveries(session: Session, before: datetime) -> None:

@@ -36,6 +36,9 @@ IN_FLIGHT = 8
 LOOK_SECONDS = 0.5
 """How often the catalog is asked what is due."""
 
+RECORD_SECONDS = 10.0
+"""A delivery's lease outlasts its attempt by this, to write down how it ended; then somebody else makes it again."""
+
 PRUNE_SECONDS = 3600.0
 
 
@@ -106,7 +109,7 @@ class Deliverer:
         with self._catalog.reading() as session:
             if not webhooks.with_due(session, self._catalog.now(session), limit=1):
                 return []
-        lease = 2 * self._settings.webhook_timeout_seconds + 30
+        lease = self._settings.webhook_timeout_seconds + RECORD_SECONDS
         with self._catalog.transaction() as tx:
             return deliveries.take(tx, self._owner, limit=limit, lease_seconds=lease)
 

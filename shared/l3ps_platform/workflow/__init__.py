@@ -10,6 +10,7 @@ claim, prolong, report       a worker takes a stage and says it is alive
 complete, drive_checked,       how it ended, and what follows from that
   model_checked, training_done,
   fail, cancelled
+pin_output, note_output      what a stage computes belongs to whoever needs it
 Reconciler, lease_lost         what nobody is left to report
 Cause, cause_of                why an attempt failed, in one word
 """
@@ -31,6 +32,7 @@ from l3ps_platform.workflow.outcomes import (
     release,
     release_owned,
 )
+from l3ps_platform.workflow.pins import doom_output, note_output, pin_output
 from l3ps_platform.workflow.planning import (
     accept_drive,
     accept_model,
@@ -40,6 +42,7 @@ from l3ps_platform.workflow.planning import (
     submit_job,
 )
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
+from l3ps_platform.workflow.sweep import Sweeper
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 
 __all__ = [
@@ -49,6 +52,7 @@ __all__ = [
     "Reconciler",
     "Report",
     "Retry",
+    "Sweeper",
     "Transaction",
     "accept_drive",
     "accept_model",
@@ -61,14 +65,17 @@ __all__ = [
     "claim",
     "complete",
     "disk_is_full",
+    "doom_output",
     "drive_checked",
     "error_json",
     "fail",
     "failure",
     "lease_lost",
     "model_checked",
+    "note_output",
     "note_training",
     "outputs_to_keep",
+    "pin_output",
     "problems_of",
     "prolong",
     "release",

@@ -10,7 +10,8 @@ from l3ps_platform.catalog import annotation_sets, bundles, drives, jobs, stages
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageState
-from l3ps_platform.errors import Conflict
+from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
 from l3ps_platform.workflow.settling import settle_job
 
@@ -36,20 +37,25 @@ def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRo
 
     Raises:
         NotFound: no such job.
-        Conflict: the job has succeeded or is not over, or its drive's archive is gone.
+        Conflict: the job has succeeded or is not over, or its drive was deleted.
         InputError: its drive or model was rejected.
     """
     job = jobs.get(tx.session, job_id)
     drive = drives.lock(tx.session, job.drive_id)
     model = bundles.lock(tx.session, job.model_id)
     job = jobs.lock(tx.session, job_id)
+    if job.deleted_at is not None:
+        raise NotFound("job", job_id)
     if job.state not in _AGAIN:
         raise Conflict(f"job {job_id} is {job.state}: only a failed or cancelled job can be run again")
-    if drive.deleted_at is not None or drive.object_key is None:
-        raise Conflict(f"the archive of drive {drive.id} is gone: upload it again and submit a new job")
+    if drive.deleted_at is not None:
+        raise Conflict(f"drive {drive.id} was deleted: upload it again and submit a new job")
+    if model.deleted_at is not None:
+        raise Conflict(f"model {model.name!r} is gone: submit a new job with another one")
     job.state, job.cancel_requested, job.error, job.quality = JobState.QUEUED, False, None, None
     job.started_at = job.finished_at = None
     tx.session.flush()
+    notices.of_parent(tx, job)
     planned = stages.of_job(tx.session, job_id)
     if not planned:
         plan_if_ready(tx, job, drive, model)
@@ -84,6 +90,7 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
             raise Conflict(f"the archive of annotations {id} is gone: upload it again and start a new training")
     training.state, training.cancel_requested, training.error = JobState.QUEUED, False, None
     training.started_at = training.finished_at = None
+    notices.of_parent(tx, training)
     stage = stages.of_training(tx.session, training_id)
     _reset(tx, stage)
     enqueue(tx, stage)

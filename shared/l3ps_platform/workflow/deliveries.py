@@ -88,10 +88,13 @@ def take(tx: Transaction, owner: str, *, limit: int, lease_seconds: float) -> li
         with suppress(NotFound):  # deleted in this moment
             hooks[id] = webhooks.lock(tx.session, id)
     busy = webhooks.in_flight(tx.session, chosen, tx.now)
-    for id in (id for id in chosen if id in hooks):
-        free = PER_WEBHOOK - busy.get(id, 0)
-        if free > 0:
-            queues.append([(hooks[id], row) for row in webhooks.due(tx.session, id, tx.now, free)])
+    for hook in (hooks[id] for id in chosen if id in hooks):
+        free = PER_WEBHOOK - busy.get(hook.id, 0)
+        rows = webhooks.due(tx.session, hook.id, tx.now, free) if free > 0 else []
+        if hook.enabled:
+            queues.append([(hook, row) for row in rows])
+        else:
+            _give_up(rows, hook)  # held when it was switched off, by a deliverer that died
     in_turn: Iterable[tuple[WebhookRow, DeliveryRow] | None] = chain.from_iterable(zip_longest(*queues))
     parcels = []
     for hook, row in [pair for pair in in_turn if pair is not None][:limit]:
@@ -157,10 +160,15 @@ def disable(tx: Transaction, hook: WebhookRow, reason: str) -> None:
     waiting = select(DeliveryRow).where(
         DeliveryRow.webhook_id == hook.id, DeliveryRow.state == DeliveryState.PENDING, DeliveryRow.lease_owner.is_(None)
     )
-    for row in tx.session.scalars(waiting):
-        row.state, row.last_error = DeliveryState.FAILED, f"the webhook was switched off: {reason}"
+    _give_up(tx.session.scalars(waiting), hook)
     tx.session.flush()
     tx.emit(EventKind.WEBHOOK_DISABLED, hook, {"id": hook.id, "url": hook.url, "reason": reason})
+
+
+def _give_up(rows: Iterable[DeliveryRow], hook: WebhookRow) -> None:
+    for row in rows:
+        row.state, row.last_error = DeliveryState.FAILED, f"the webhook was switched off: {hook.disabled_reason}"
+        row.lease_owner = row.lease_until = None
 
 
 def enable(hook: WebhookRow) -> None:

@@ -75,6 +75,8 @@ def submit_job(
     if drive.deleted_at is not None:
         raise NotFound("drive", drive_id)
     bundle = bundles.lock(tx.session, bundles.by_name(tx.session, model).id)
+    if bundle.deleted_at is not None:
+        raise NotFound("model", model)
     job = JobRow(
         id=new_id("job"),
         drive_id=drive.id,

@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
 import structlog
-from sqlalchemy import select, update
+from sqlalchemy import ColumnElement, select, update
 
-from l3ps_platform.catalog import annotation_sets, bundles, drives, uploads
 from l3ps_platform.catalog.attempt_rows import Outcome
-from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, ModelRow, StageRow
+from l3ps_platform.catalog.models import StageRow
 from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
-from l3ps_platform.catalog.states import QueueName, StageState, UploadState
-from l3ps_platform.errors import CatalogUnavailable, Conflict, PlatformError
+from l3ps_platform.catalog.states import QueueName, StageState
+from l3ps_platform.errors import CatalogUnavailable, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
 from l3ps_platform.workflow.arrivals import settle_arrivals
@@ -30,6 +27,7 @@ from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import Retry, failed
 from l3ps_platform.workflow.planning import enqueue
+from l3ps_platform.workflow.sweep import Sweeper
 
 if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it
     from l3ps_platform.queue import Queue
@@ -46,8 +44,13 @@ class Report:
     expired: int = 0
     retried: int = 0
     resent: int = 0
+    spent: int = 0
     uploads: int = 0
     archives: int = 0
+    expired_jobs: int = 0
+    jobs: int = 0
+    outputs: int = 0
+    orphans: int = 0
     arrivals: int = 0
 
 
@@ -57,15 +60,15 @@ class Reconciler:
     Args:
         catalog: whose sender is ``queue.send``.
         queue: to see which messages are still on their way.
-        store: to drop abandoned uploads and archives of what was rejected or deleted.
+        store: for the sweep of what nobody needs any more.
         settings: intervals and limits.
     """
 
     def __init__(self, catalog: Catalog, queue: Queue, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
         self._queue = queue
-        self._store = store
         self._settings = settings
+        self._sweeper = Sweeper(catalog, store, settings)
         self._retry = Retry.of(settings)
         self._leases_count_from = float("-inf")
 
@@ -91,9 +94,9 @@ class Reconciler:
             expired=self._expire_leases(),
             retried=self._release_retries(),
             resent=self._resend(),
-            uploads=self._abort_uploads(),
-            archives=self._delete_archives(),
+            spent=self._drop_spent(),
             arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs),
+            **self._sweeper.run_once(),
         )
 
     def _bear_old_leases(self) -> None:
@@ -143,36 +146,20 @@ class Reconciler:
                     tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
             return len(tx.outbox)
 
-    def _abort_uploads(self) -> int:
+    def _drop_spent(self) -> int:
+        """Forget messages that a killed worker left delivered for ever, once there is nothing left to do for them."""
+        delivered = self._queue.delivered()
+        if not delivered:
+            return 0
+        wanted = (StageRow.id.in_({stage_id for stage_id, _ in delivered.values()}), ~_over())
         with self._catalog.reading() as session:
-            over = uploads.expired(session, self._catalog.now(session))
-        for row in over:
-            with self._catalog.transaction() as tx, suppress(Conflict):  # completed in this moment
-                uploads.close(tx, row.id, UploadState.ABORTED)
-        with self._catalog.reading() as session:
-            rows = uploads.leftover(session)
-        for row in rows:
-            self._store.abort_multipart(row.object_key, row.s3_upload_id)
-            self._store.delete(row.object_key)  # joined, when the API died before it could say so
-            with self._catalog.transaction() as tx:
-                uploads.lock(tx.session, row.id).s3_upload_id = ""
-        return len(rows)
-
-    def _delete_archives(self) -> int:
-        with self._catalog.reading() as session:
-            found: Iterable[AnnotationsRow | DriveRow | ModelRow] = [
-                *annotation_sets.leftover_archives(session),
-                *drives.leftover_archives(session),
-                *bundles.leftover_archives(session),
-            ]
-        count = 0
-        for row in found:
-            if row.object_key is not None:
-                self._store.delete(row.object_key)
-            with self._catalog.transaction() as tx:
-                tx.session.merge(row, load=True).object_key = None
-                count += 1
-        return count
+            alive = {
+                (id, attempt) for id, attempt in session.execute(select(StageRow.id, StageRow.attempt).where(*wanted))
+            }
+        spent = [tag for tag, pair in delivered.items() if pair not in alive]
+        if spent:
+            self._queue.drop(spent)
+        return len(spent)
 
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:
@@ -182,6 +169,10 @@ class Reconciler:
     def _now(self) -> datetime:
         with self._catalog.reading() as session:
             return self._catalog.now(session)
+
+
+def _over() -> ColumnElement[bool]:
+    return StageRow.state.in_([state for state in StageState if state.final])
 
 
 def lease_lost(

@@ -18,15 +18,31 @@ from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
 from l3ps_cli.main import app
+from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import QUEUES, STOP_WORKER, TRAINER_QUEUES, WORKER, Stack, StackOptions, free_port
-from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog
+from l3ps_platform import workflow
+from l3ps_platform.catalog import (
+    DEFAULT_PROJECT,
+    Catalog,
+    DriveState,
+    ModelState,
+    StageState,
+    bundles,
+    drives,
+    stages,
+)
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.objects import ObjectStore, open_store
 from l3ps_platform.settings import Settings
 
 MiB = 1 << 20
-TUNING = {"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"}
+TUNING = {
+    **{"L3PS_PART_BYTES": str(5 * MiB), "L3PS_MAX_MODEL_BYTES": str(8 * MiB), "L3PS_RECONCILE_SECONDS": "0.5"},
+    **{"L3PS_WEBHOOK_ALLOW": "127.0.0.1/32", "L3PS_WEBHOOK_HTTP": "1"},
+    **{"L3PS_WEBHOOK_RETRY_SECONDS": "0,0.1,0.1", "L3PS_WEBHOOK_TIMEOUT_SECONDS": "3"},
+    "L3PS_LOG_FORMAT": "json",  # test_logs reads them
+}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -83,6 +99,14 @@ class Service:
             assert time.monotonic() < deadline, document
             time.sleep(0.1)
         return document
+
+    @staticmethod
+    def until(true: Callable[[], bool], seconds: float = 60) -> None:
+        """Wait for something to be true."""
+        deadline = time.monotonic() + seconds
+        while not true():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
 
     def wait_for_drive(self, drive_id: str) -> dict:
         """A drive once it has been checked."""
@@ -230,6 +254,22 @@ def bundle(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def observed(service, drive_log, bundle, tmp_path_factory) -> dict:
+    """A job that was looked after: its document once it succeeded, with the id of the request that made it."""
+    folder = tmp_path_factory.mktemp("observed")
+    pack_log(drive_log, folder / "log.tar")
+    pack_bundle(bundle, folder / "model.zip")
+    model = service.upload((folder / "model.zip").read_bytes(), "model.zip", "model", name="observed").json()
+    drive = service.upload((folder / "log.tar").read_bytes() + bytes(512), "log.tar").json()
+    service.wait(f"/v1/models/{model['id']}", lambda document: document["state"] == "ready")
+    request = {"drive_id": drive["id"], "model": "observed", "preset": "fast"}
+    answer = service.http.post("/v1/jobs", json=request, headers={"X-Request-Id": "test-4711"})
+    job = service.wait_for_job(answer.json()["id"])
+    assert job["state"] == "succeeded", job
+    return job | {"request": answer.headers["x-request-id"]}
+
+
+@pytest.fixture(scope="session")
 def api_process(tmp_path_factory) -> Iterator:
     """Starts an API of its own, without a worker; called with settings, returns its URL once it answers at all."""
     folder = tmp_path_factory.mktemp("api")
@@ -252,3 +292,63 @@ def _alive(url: str) -> bool:
         return httpx.get(f"{url}/healthz").is_success
     except httpx.TransportError:
         return False
+
+
+class Played:
+    """A job whose worker the test plays, on a drive and a model that exist in the catalog alone."""
+
+    def __init__(self, catalog: Catalog, scenes: int = 1) -> None:
+        self.catalog = catalog
+        file = {"filename": "f.zip", "size": 9, "object_key": None}
+        with catalog.transaction() as tx:
+            drive = drives.add(tx, name="played", **file)
+            drive.state = DriveState.READY
+            drive.info = {"scenes": [{"name": f"scene-{n}", "scans": 1, "points": 5} for n in range(scenes)]}
+            model = bundles.add(tx, name=f"played-{secrets.token_hex(4)}", **file)
+            model.state, model.info = ModelState.READY, {}
+            tx.session.flush()
+            self.id = workflow.submit_job(tx, drive_id=drive.id, model=model.id).id
+
+    def take(self) -> workflow.Claim:
+        """Claim the next stage that waits for a worker."""
+        with self.catalog.transaction() as tx:
+            stage = next(row for row in stages.of_job(tx.session, self.id) if row.state is StageState.QUEUED)
+            claim = workflow.claim(tx, stage.id, stage.attempt, "test", lease_seconds=600, max_attempts=3)
+        assert claim is not None
+        return claim
+
+    def report(self, claim: workflow.Claim, step: str, done: int, total: int) -> None:
+        """Tell of progress."""
+        with self.catalog.transaction() as tx:
+            workflow.report(tx, claim, step, done, total, fraction=done / total)
+
+    def complete(self, claim: workflow.Claim) -> None:
+        """Finish a stage."""
+        with self.catalog.transaction() as tx:
+            workflow.complete(tx, claim, workflow.Cost(1.0), output_key="stages/none")
+
+    def finish(self) -> None:
+        """Finish the job."""
+        with self.catalog.reading() as session:
+            left = sum(not row.state.final for row in stages.of_job(session, self.id))
+        for _ in range(left):
+            self.complete(self.take())
+
+    def cancel(self) -> None:
+        """Cancel the job."""
+        with self.catalog.transaction() as tx:
+            workflow.cancel_job(tx, self.id)
+
+
+@pytest.fixture
+def played(service) -> Iterator[Callable[..., Played]]:
+    """Makes a job that the test plays the worker of; what is left of it is cancelled."""
+    made: list[Played] = []
+
+    def make(scenes: int = 1) -> Played:
+        made.append(Played(service.catalog, scenes))
+        return made[-1]
+
+    yield make
+    for job in made:
+        job.cancel()

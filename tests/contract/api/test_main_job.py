@@ -99,6 +99,24 @@ def test_jobs_come_in_pages_newest_first(service, finished):
     assert {job["state"] for job in only} == {"succeeded"}
 
 
+def test_jobs_are_found_by_what_they_are_on_and_when_they_were_made(service, finished):
+    def found(**wanted) -> set[str]:
+        answer = service.http.get("/v1/jobs", params={"limit": 200} | wanted)
+        assert answer.status_code == 200, answer.text
+        return {job["id"] for job in answer.json()["items"]}
+
+    on_it = {"drive_id": finished["drive"]["id"], "model_id": finished["model"]["id"]}
+    assert finished["id"] in found(**on_it, state=["succeeded", "failed"], created_after=finished["created_at"])
+    assert finished["id"] not in found(**on_it, created_before=finished["created_at"])
+    assert found(drive_id="drv_none") == set()
+    assert found(created_after="0001-01-01T00:00:00+14:00", created_before="9999-12-31T23:59:59-14:00") >= found(
+        **on_it
+    )
+    for name, value in (("created_after", "yesterday"), ("created_before", "2026-01-01T00:00:00"), ("state", "done")):
+        answer = service.http.get("/v1/jobs", params={name: value})
+        assert service.refused(answer, 422, "invalid-request")["errors"][0]["where"].startswith(f"query {name}")
+
+
 def test_metrics_tell_of_scans_points_seconds_and_quality(service, finished):
     metrics = service.http.get("/metrics").text
     assert 'stage="refine"' in metrics
@@ -133,6 +151,9 @@ def test_a_job_can_be_cancelled(service, finished, packed):
     answer = service.http.post(f"/v1/jobs/{job['id']}/cancel")
     assert answer.status_code == 202 and answer.json()["cancel_requested"]
     assert service.wait_for_job(job["id"])["state"] == "cancelled"
+    assert service.http.post(f"/v1/jobs/{job['id']}/cancel").status_code == 202, "it stays so"
+    over = service.http.post(f"/v1/jobs/{finished['id']}/cancel")
+    assert "succeeded already" in service.refused(over, 409, "conflict")["detail"]
     answer = service.http.get(f"/v1/jobs/{job['id']}/labels")
     service.refused(answer, 409, "no-labels")
 

@@ -78,6 +78,16 @@ def test_a_cancelled_job_shows_at_once(catalog: Catalog, services: Services, pla
     assert json.loads(service.encoded(services, job))["cancel_requested"]
 
 
+def test_a_deleted_job_is_gone_though_its_document_was_kept(catalog: Catalog, services: Services, play) -> None:
+    job = play.submit(scenes=1)
+    service.cancel(services, job)
+    service.encoded(services, job)
+    service.delete(services, job)
+    for read in (service.encoded, service.get):
+        with pytest.raises(NotFound):
+            read(services, job)
+
+
 def test_a_kept_document_is_its_project_s_alone(catalog: Catalog, services: Services, play) -> None:
     job = play.submit(scenes=1)
     service.encoded(services, job)

@@ -1,14 +1,17 @@
 """What Prometheus is told, computed from both databases and a real Redis."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select, text, update
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import AttemptRow, Catalog, StageRow, bundles
+from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.metrics import LATE, CatalogCollector
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
@@ -192,6 +195,24 @@ def test_counters_never_go_down_and_the_past_is_read_once(catalog: Catalog, play
     assert scrape(catalog, tidy.queue)[points] == 10, "and a new process does sum it"
 
 
+def test_scrapes_at_the_same_time_remember_the_past_once(catalog: Catalog, play, sent, tidy, cost) -> None:
+    play.submit(scenes=1)
+    while sent:
+        play.run(lambda tx, claim: workflow.complete(tx, claim, cost))
+    with catalog.transaction() as tx:
+        for row in tx.session.scalars(select(AttemptRow)):
+            row.finished_at -= 2 * LATE
+    collector, barrier = CatalogCollector(catalog, tidy.queue), threading.Barrier(4)
+
+    def scrape_with_others(_: int) -> Found:
+        barrier.wait()
+        return scraped(collector)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(scrape_with_others, range(4)))
+    assert scraped(collector)["l3ps_points_total", (("project", "prj_default"), ("stage", "refine"))] == 10
+
+
 def test_the_quality_of_a_model_is_that_of_its_latest_job(catalog: Catalog, play, sent, tidy, cost) -> None:
     drive, model = play.drive(scenes=1), play.model()
 
@@ -241,3 +262,41 @@ def test_others_add_their_own_metrics(catalog: Catalog, tidy) -> None:
 
     collector.add(stages)
     assert scraped(collector)["l3ps_webhooks", ()] == 0
+
+
+def test_counters_begin_where_they_stood_before_attempts_were_kept(empty_url: str, tidy) -> None:
+    """Stages and qualities of an older catalog are remembered by the migration."""
+    upgrade(empty_url, "0005")
+    catalog = Catalog(empty_url)
+    when = "'2026-01-01 00:00:00+00:00'"
+    quality = '{"protocol": "nuscenes", "primal": {"pq": 30.0}, "refined": {"pq": 40.0}}'
+    owned = "INSERT INTO {} (id, project_id, name, filename, size, state, created_at) VALUES ('{}', 'prj_default', "
+    with catalog.transaction() as tx:
+        for table, id in (("drives", "drv_1"), ("models", "mdl_1")):
+            tx.session.execute(text(owned.format(table, id) + f"'{id}', 'f.zip', 9, 'ready', {when})"))
+        for id, pq in (("job_1", "39.0"), ("job_2", "40.0")):
+            tx.session.execute(
+                text(
+                    "INSERT INTO jobs (id, project_id, drive_id, model_id, settings, state, cancel_requested, quality, "
+                    f"created_at, finished_at) VALUES ('{id}', 'prj_default', 'drv_1', 'mdl_1', '{{}}', 'succeeded', "
+                    f"false, :quality, {when}, {when})"
+                ),
+                {"quality": quality.replace("40.0", pq)},
+            )
+        for number, state in enumerate(("done", "failed", "queued")):
+            tx.session.execute(
+                text(
+                    "INSERT INTO stages (id, job_id, name, queue, state, attempt, progress_done, progress_total, "
+                    "fraction, cached, seconds, points, started_at, finished_at) VALUES "
+                    f"('stg_{number}', 'job_1', 'refine', 'refine', '{state}', 1, 0, 0, "
+                    f"0, false, 2.5, 10, {when}, {when})"
+                )
+            )
+    upgrade(empty_url)
+    found = scrape(catalog, tidy.queue)
+    per_stage = (("project", "prj_default"), ("stage", "refine"))
+    assert found["l3ps_points_total", per_stage] == 10
+    assert found["l3ps_attempts_total", (("outcome", "failed"), ("stage", "refine"))] == 1
+    labels = (("labels", "refined"), ("model", "mdl_1"), ("project", "prj_default"), ("protocol", "nuscenes"))
+    assert found["l3ps_model_pq", labels] == 40.0, "the latest job's"
+    catalog.dispose()

@@ -189,3 +189,24 @@ def test_the_loop_stops_when_told(tidy, catalog: Catalog) -> None:
     stop = threading.Event()
     stop.set()
     Reconciler(catalog, tidy.queue, tidy.store, tidy.settings).run(stop)
+
+
+def test_a_message_that_a_killed_worker_held_is_forgotten_when_its_stage_is_over(tidy, play, sent, redis_url) -> None:
+    """Redis would deliver it again after a day; nobody acknowledges it before."""
+    import json
+
+    import redis
+
+    job = play.submit(scenes=1)
+    message = sent[0]
+    tidy.queue.send([message])
+    with redis.Redis.from_url(redis_url) as client:  # as kombu keeps what was delivered
+        entry = json.dumps([json.loads(client.lpop(message.queue)), message.queue, message.queue])
+        client.hset("unacked", "tag", entry)
+        client.zadd("unacked_index", {"tag": 1.0})
+        assert tidy.queue.delivered() == {"tag": (message.stage_id, 1)}
+        assert tidy().spent == 0
+        play.finish_all()
+        assert play.job(job).state is JobState.SUCCEEDED
+        assert tidy().spent == 1
+        assert (client.hlen("unacked"), client.zcard("unacked_index")) == (0, 0)

@@ -237,7 +237,7 @@ def worker(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     running: list[subprocess.Popen[bytes]] = []
 
     def start(bench: Bench, queues: str = "segment,refine", **extra: str) -> subprocess.Popen[bytes]:
-        given = bench.settings.model_dump(exclude_none=True, exclude={"token"})
+        given = bench.settings.model_dump(exclude_unset=True, exclude_none=True)
         environment = os.environ | {f"L3PS_{name.upper()}": str(value) for name, value in given.items() if value != ""}
         command = [sys.executable, "-m", "celery", "-A", "l3ps_worker.app", "worker", "-Q", queues, "-c", "1"]
         command += ["--without-gossip", "--without-mingle"]  # a second less to start

@@ -1,5 +1,6 @@
 """What the stages do, run in this process on SQLite and a directory."""
 
+import errno
 import hashlib
 import io
 import json
@@ -14,8 +15,9 @@ import pytest
 from l3ps.drivelog import open_drive
 from l3ps.evaluate import evaluate_drive
 from l3ps.labels import open_labels, read_poses
-from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState
-from l3ps_platform.errors import StoreUnavailable
+from l3ps_platform import workflow
+from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs
+from l3ps_platform.errors import CatalogUnavailable, StoreUnavailable
 from l3ps_worker import runner
 
 
@@ -268,15 +270,16 @@ def during(monkeypatch: pytest.MonkeyPatch, name, action) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "again", "said"),
+    ("error", "cause", "failures", "said"),
     [
-        (MemoryError(), True, "out of memory"),
-        (StoreUnavailable("the store is away"), True, "the store is away"),
-        (ZeroDivisionError("division by zero"), True, "ZeroDivisionError: division by zero"),
+        (MemoryError(), "out-of-memory", 1, "out of memory"),
+        (StoreUnavailable("the store is away"), "store-unavailable", 0, "the store is away"),
+        (ZeroDivisionError("division by zero"), "internal", 1, "ZeroDivisionError: division by zero"),
+        (OSError(errno.ENOSPC, "No space left"), "disk-full", 0, "the disk is full"),
     ],
-    ids=["memory", "store", "bug"],
+    ids=["memory", "store", "bug", "disk"],
 )
-def test_what_may_pass_is_tried_again(direct, drive_zip: Path, monkeypatch, error, again, said) -> None:
+def test_what_may_pass_is_tried_again(direct, drive_zip: Path, monkeypatch, error, cause, failures, said) -> None:
     def broken(*_: object) -> None:
         raise error
 
@@ -287,8 +290,57 @@ def test_what_may_pass_is_tried_again(direct, drive_zip: Path, monkeypatch, erro
         from l3ps_platform.catalog import stages
 
         stage = stages.ingest_of(session, drive_id=drive)
-    assert (stage.state, stage.attempt) == (StageState.WAITING, 2)
+    assert (stage.state, stage.attempt, stage.failures) == (StageState.WAITING, 2, failures)
+    assert (stage.error["cause"], stage.finished_at) == (cause, None)
     assert said in stage.error["message"]
+
+
+def test_what_is_done_waits_for_a_catalog_that_is_away(direct, drive_zip: Path, monkeypatch) -> None:
+    """The work is not lost with the first commit that fails."""
+    drive, real, failures = direct.upload_drive(drive_zip), direct.context.catalog, [1, 2]
+
+    class Away:
+        """The catalog, away for two transactions once the stage's work is done."""
+
+        def __getattr__(self, name: str):
+            return getattr(real, name)
+
+        def transaction(self):
+            if done and failures:
+                failures.pop()
+                raise CatalogUnavailable("the catalog does not answer")
+            return real.transaction()
+
+    done: list[bool] = []
+    work, steps = runner.WORK[runner.StageName.INGEST]
+
+    def noted(*given):
+        result = work(*given)
+        done.append(True)
+        return result
+
+    monkeypatch.setitem(runner.WORK, runner.StageName.INGEST, (noted, steps))
+    direct.context.catalog = Away()
+    assert direct.step() == "done"
+    assert not failures
+    assert direct.drive(drive).state is DriveState.READY
+
+
+def test_an_archive_that_reads_otherwise_than_checked_is_the_store_s_fault(
+    direct, drive_zip: Path, short_zip: Path, fast_model: Path
+) -> None:
+    drive = direct.upload_drive(drive_zip)
+    direct.upload_model(fast_model)
+    direct.run()
+    shutil.rmtree(direct.settings.scratch / "cache")
+    (direct.settings.scratch / "cache").mkdir()
+    job = direct.submit(drive)
+    direct.store.put_file(direct.drive(drive).object_key, short_zip)
+    assert direct.step() == "failed"
+    stage = direct.stages(job)[0]
+    assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "store-unavailable")
+    direct.store.put_file(direct.drive(drive).object_key, drive_zip)
+    assert direct.step() == "done"
 
 
 def test_bad_input_found_late_is_not_tried_again(direct, drive_zip: Path, fast_model: Path, monkeypatch) -> None:
@@ -319,3 +371,23 @@ def test_a_drive_s_log_is_fetched_again_when_the_scratch_lost_it(direct, drive_z
     (direct.settings.scratch / "cache").mkdir()
     direct.submit(drive)
     assert direct.step() == "done"
+
+
+def test_what_a_stage_makes_stays_while_a_job_that_was_not_deleted_uses_it(
+    direct, short_zip: Path, fast_model: Path
+) -> None:
+    drive = direct.upload_drive(short_zip)
+    direct.upload_model(fast_model)
+    first, second = (direct.submit(drive, preset="fast") for _ in range(2))
+    assert set(direct.run()) == {"done"}
+    made = {info.key for info in direct.store.list("stages/")}
+    sweeper = workflow.Sweeper(direct.catalog, direct.store, direct.settings)
+    for job, left in ((first, made), (second, set())):
+        with direct.catalog.transaction() as tx:
+            jobs.delete(tx, job)
+        with direct.catalog.reading() as session:
+            sizes = outputs.stored_bytes(session) - direct.drive(drive).size
+        assert sizes >= sum(direct.store.stat(key).size for key in made if not key.endswith("scene.json"))
+        sweeper.run_once()
+        assert {info.key for info in direct.store.list("stages/")} == left
+    assert list(direct.store.list("jobs/")) == []

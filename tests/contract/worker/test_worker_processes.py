@@ -124,3 +124,21 @@ def test_a_stage_that_takes_too_long_is_stopped_with_that_reason(
         job = bench.finished(bench.submit(drive, preset="fast"))
         assert job.state is JobState.FAILED
         assert "ran for more than 3 s" in job.error["message"]
+
+
+def test_a_child_that_goes_on_after_its_job_was_cancelled_is_killed(
+    served, worker, short_zip: Path, slow_model: Path
+) -> None:
+    """A stopped child hears nothing, like one deep in compiled code; its worker goes on without it."""
+    with served(cancel_seconds=0.5, heartbeat_seconds=0.2, progress_seconds=2.0) as bench:
+        process = worker(bench)
+        drive, _ = bench.upload_drive(short_zip), bench.upload_model(slow_model)
+        job = bench.submit(drive, preset="fast")
+        stage = bench.until(lambda: at_work(bench, job))
+        os.kill(child_of(stage), signal.SIGSTOP)
+        bench.cancel(job)
+        assert bench.finished(job).state is JobState.CANCELLED
+        assert not alive(child_of(stage))
+        killed = next(s for s in bench.stages(job) if s.id == stage.id)
+        assert (killed.state, killed.error["cause"]) == (StageState.CANCELLED, "cancelled")
+        assert process.poll() is None

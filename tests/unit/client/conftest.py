@@ -23,7 +23,11 @@ def serving(answer) -> Iterator[ThreadingHTTPServer]:
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
-        do_GET = do_PUT = do_POST = do_DELETE = do_PATCH = lambda self: answer(self)  # noqa: N815
+
+        def do(self):
+            answer(self)
+
+        do_GET = do_PUT = do_POST = do_DELETE = do_PATCH = do  # noqa: N815
 
         def log_message(self, *_):
             pass

@@ -1,4 +1,4 @@
-"""One request at a time: what is repeated, how an error becomes an exception, where the service is looked for."""
+"""One request at a time: what is repeated, what an error answer becomes, where the service is looked for."""
 
 import json
 import os
@@ -179,6 +179,14 @@ def test_what_a_stack_that_was_killed_left_behind_is_not_believed(local):
     local("http://127.0.0.1:1", 2**22 + 1)  # beyond the largest process id
     with Client() as client:
         assert client.url == "http://127.0.0.1:8080"
+
+
+def test_a_proxy_of_the_environment_is_not_asked_for_this_machine(server, monkeypatch):
+    monkeypatch.setenv("HTTP_PROXY", "http://127.0.0.1:1")
+    monkeypatch.setenv("NO_PROXY", "")
+    server.script += [answer({"scope": "read"})]
+    with Client(server.url, "t", retry=Retry(first=0.0)) as client:
+        assert client.me() == {"scope": "read"}
 
 
 def test_the_project_goes_with_every_request(server):

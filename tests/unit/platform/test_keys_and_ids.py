@@ -1,19 +1,30 @@
 """Names: ids that sort, keys that stay inside, URLs that permit one thing."""
 
 import threading
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from l3ps_platform.errors import InvalidKey, InvalidSignature
-from l3ps_platform.ids import is_id, new_id
+from l3ps_platform.ids import is_id, lowest_id, new_id
 from l3ps_platform.objects import Grant, Signer, check_key, content_type, segment
 
 
 def test_ids_sort_in_the_order_they_were_made() -> None:
     ids = [new_id("job") for _ in range(5000)]
     assert ids == sorted(set(ids))
+
+
+def test_an_id_lies_between_the_bounds_of_its_moment() -> None:
+    before = datetime.now(UTC)
+    made = new_id("job")
+    later = before + timedelta(hours=1)
+    assert lowest_id("job", before) <= made < lowest_id("job", later)
+    assert is_id(lowest_id("job", later), "job")
+    for moment in (datetime.min, datetime.max):
+        assert is_id(lowest_id("job", moment.replace(tzinfo=UTC)), "job")
 
 
 def test_ids_from_many_threads_are_unique() -> None:

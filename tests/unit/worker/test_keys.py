@@ -1,5 +1,6 @@
 """Content-addressed keys: equal for equal work, different for different work."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,3 +107,11 @@ def test_labels_of_another_build_of_the_clustering_are_other_labels(monkeypatch)
     assert refine() != before
     assert segment() == primal, "images know no clusters"
     keys.code_version.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "name", ["../../etc", "a/../../b", "x\x00y", "ü" * 300, "con:1", "%2e%2e", "", "-rf", "a" * 1000]
+)
+def test_no_name_of_a_log_is_part_of_an_output_s_key(name: str) -> None:
+    """Scenes are called what the log calls them; the key holds a digest of that."""
+    assert re.fullmatch(r"stages/prj_a/segment-[0-9a-f]{64}", segment(scene=name))

@@ -1,5 +1,6 @@
 """The worker's disk: made once, kept while used, bounded, and clean after the dead."""
 
+import errno
 import subprocess
 import sys
 import threading
@@ -118,3 +119,39 @@ def test_work_of_a_killed_process_is_swept_and_that_of_a_living_one_is_not(tmp_p
     scratch = Scratch(tmp_path, 0)
     with scratch.workdir() as first, Scratch(tmp_path, 0).workdir() as second:
         assert sorted((tmp_path / "work").iterdir()) == sorted([first, second])
+
+
+def test_a_full_disk_costs_the_entries_that_nobody_uses(tmp_path: Path) -> None:
+    scratch, tries = Scratch(tmp_path, 1000), []
+    for name in ("idle", "used"):
+        with scratch.entry(name, writing(b"x")):
+            pass
+
+    def make(target: Path) -> None:
+        tries.append((tmp_path / "cache" / "idle").exists())
+        target.write_bytes(b"half")
+        if len(tries) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        target.write_bytes(b"whole")
+
+    with Scratch(tmp_path, 1000).entry("used", writing(b"")), scratch.entry("wanted", make) as path:
+        assert path.read_bytes() == b"whole"
+        assert (tmp_path / "cache" / "used" / "log").exists()
+    assert tries == [True, False]
+
+
+def test_a_disk_that_stays_full_leaves_nothing_half_made(tmp_path: Path) -> None:
+    def fill(target: Path) -> None:
+        target.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"), Scratch(tmp_path, 1000).entry("wanted", fill):
+        pass
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_half_an_entry_that_nobody_wants_again_goes_too(tmp_path: Path) -> None:
+    (tmp_path / "cache" / "drive-1").mkdir(parents=True)
+    (tmp_path / "cache" / "drive-1" / "new").write_bytes(b"half")
+    with Scratch(tmp_path, 1000).entry("drive-2", writing(b"whole")):
+        assert not (tmp_path / "cache" / "drive-1").exists()

@@ -84,7 +84,8 @@ async def follow_project(
         Query(max_length=500, description="Only these types, separated by commas; `job.*` takes a group."),
     ] = None,
     subject: Annotated[
-        str | None, Query(max_length=40, description="Only of this job, drive, model or training.")
+        str | None,
+        Query(max_length=40, pattern="^[a-z0-9_]*$", description="Only of this job, drive, model or training."),
     ] = None,
     last_event_id: LastEventId = None,
 ) -> Response:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import structlog
 from fastapi.concurrency import run_in_threadpool
-from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+from fastapi.responses import StreamingResponse
+from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 from starlette.types import Message, Send
 
 from l3ps_api.events.hub import PAGE, Entry, EventHub
@@ -20,6 +21,8 @@ log = structlog.get_logger(__name__)
 
 HEARTBEAT_SECONDS = 15.0
 RETRY_MS = 2000
+LIFE_SECONDS = 900.0
+"""A stream lives no longer: whose key was revoked meanwhile does not come back, others go on where they were."""
 SEND_SECONDS = 30.0
 """A client that takes nothing for so long, its buffers and ours full, is hung up on."""
 
@@ -45,8 +48,14 @@ class Feed:
     over: bool = False
 
 
-class EventStream(EventSourceResponse):
-    """The answer: never kept by anyone on the way, and ended when the client does not take it."""
+class EventStream(StreamingResponse):
+    """The answer: never kept by anyone on the way, and ended when the client does not take it.
+
+    Not FastAPI's class of this purpose, which wants routes that yield: ours says before the stream begins whether there
+    is one.
+    """
+
+    media_type = "text/event-stream"
 
     def __init__(self, content: AsyncIterator[bytes]) -> None:
         super().__init__(content, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
@@ -65,15 +74,16 @@ class EventStream(EventSourceResponse):
 
 
 async def told(hub: EventHub, feed: Feed) -> AsyncIterator[bytes]:
-    """The stream's bytes. Ends with the job, when the process stops, or when the log cannot be read."""
+    """The stream's bytes. Ends with the job, in good time, when the process stops, or when the log cannot be read."""
     yield format_sse_event(retry=RETRY_MS) + feed.opening
     if feed.over:
         return
     cursor, shown = feed.cursor, None
     clock = asyncio.get_running_loop().time
     last_sent = clock()
+    ends = last_sent + LIFE_SECONDS
     async with hub.listening(feed.job_id):
-        while not hub.closing:
+        while not hub.closing and clock() < ends:
             news = hub.news
             try:
                 found, cursor, more = await _after(hub, feed, cursor)

@@ -53,7 +53,7 @@ def get_job(job_id: str, services: ServicesDep) -> Response:
 
 @router.post("/{job_id}/cancel", status_code=202)
 def cancel_job(job_id: str, services: ServicesDep) -> Job:
-    """Ask a job to stop; what runs stops at its next scan. Refused when the job is over."""
+    """Ask a job to stop; what runs stops at its next scan. Refused when it has succeeded or failed."""
     return service.cancel(services, job_id)
 
 
@@ -61,3 +61,9 @@ def cancel_job(job_id: str, services: ServicesDep) -> Job:
 def retry_job(job_id: str, services: ServicesDep) -> Job:
     """Run a failed or cancelled job again: only what is missing. Refused in every other state."""
     return service.retry(services, job_id)
+
+
+@router.delete("/{job_id}", status_code=204)
+def delete_job(job_id: str, services: ServicesDep) -> None:
+    """Delete a finished job and its labels. Refused while it is not over; what other jobs share with it stays."""
+    service.delete(services, job_id)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 
+import structlog
 from sqlalchemy.orm import Session
 
 from l3ps.errors import InputError
@@ -14,7 +15,11 @@ from l3ps_api.problems import ApiProblem, invalid, items
 from l3ps_api.services import Services
 from l3ps_api.sources import permitted
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
+from l3ps_platform.catalog.requests import note_result
+from l3ps_platform.errors import Conflict
 from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
+
+log = structlog.get_logger(__name__)
 
 _STEPS = (
     *("segment", "accumulate", "ground", "cluster", "vote", "instances", "write", "evaluate", "store"),
@@ -44,6 +49,7 @@ def create(services: Services, project_id: str, request: JobRequest) -> Job:
         )
         detail = f"The log or model cannot be used as it is; it has {count}, the first: {found[0]} {remedy}"
         raise ApiProblem(422, "unusable-input", "The job's input cannot be used", detail, items(found)) from error
+    log.info("job accepted", job=job.id, drive=job.drive_id, model=job.model_id)
     return get(services, job.id)
 
 
@@ -87,9 +93,12 @@ def encoded(services: Services, job_id: str) -> bytes:
 
 
 def cancel(services: Services, job_id: str) -> Job:
-    """Ask a job to stop. NotFound, Conflict when it is over."""
+    """Ask a job to stop; one that is cancelled stays so. NotFound, Conflict when it came to another end."""
     with services.catalog.transaction() as tx:
-        cancel_job(tx, job_id)
+        state = cancel_job(tx, job_id).state
+        if state in (JobState.SUCCEEDED, JobState.FAILED):
+            raise Conflict(f"job {job_id} has {state} already: there is nothing left to cancel")
+        note_result(tx.session, "jobs", job_id)
     return get(services, job_id)
 
 
@@ -100,7 +109,14 @@ def retry(services: Services, job_id: str) -> Job:
     gone = [key for key in wanted if not services.store.exists(key)]
     with services.catalog.transaction() as tx:
         retry_job(tx, job_id, gone)
+        note_result(tx.session, "jobs", job_id)
     return get(services, job_id)
+
+
+def delete(services: Services, job_id: str) -> None:
+    """Hide a finished job at once; the reconciler deletes its labels. NotFound, Conflict while it is not over."""
+    with services.catalog.transaction() as tx:
+        jobs.delete(tx, job_id)
 
 
 def _document(session: Session, job_id: str) -> Job:

@@ -2,45 +2,62 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from l3ps_api.labels.schemas import LabelFile, LabelFiles
-from l3ps_api.problems import ApiProblem, conflict, invalid
+from l3ps_api.labels.manifests import published, side_of
+from l3ps_api.labels.schemas import LabelFile, LabelFiles, Side
+from l3ps_api.problems import ApiProblem, ErrorItem, invalid
 from l3ps_api.services import Services
-from l3ps_platform.catalog import JobRow, JobState, StageName, jobs, stages
 
 
-def files(services: Services, job_id: str, label_format: str | None) -> LabelFiles:
-    """The files of one format, with those that belong to every format (poses). NotFound for the job."""
-    with services.catalog.reading() as session:
-        job = jobs.get(session, job_id)
-        publish = next((row for row in stages.of_job(session, job_id) if row.name is StageName.PUBLISH), None)
-    if job.state is not JobState.SUCCEEDED or publish is None or publish.output_key is None:
-        raise _no_labels(job)
-    made: list[str] = job.settings["formats"]
-    chosen = label_format or made[0]
-    if chosen not in made:
-        what = f"the job wrote {' and '.join(made)}, not {chosen}"
-        raise invalid("format", what, "Ask for a format it wrote, or submit a job that writes this one.")
-    manifest: dict[str, Any] = json.loads(services.store.get_bytes(publish.output_key))
-    seconds = services.settings.url_ttl_seconds
-    listed = [
-        LabelFile(
-            path=file["path"],
-            size=file["size"],
-            sha256=file["sha256"],
-            url=services.store.presign_get(file["key"], seconds, file["path"].rpartition("/")[2]),
-        )
-        for file in manifest["files"]
-        if file["format"] in (None, chosen)
-    ]
-    return LabelFiles(job_id=job_id, format=chosen, files=listed)
+def files(
+    services: Services,
+    job_id: str,
+    label_format: str | None,
+    *,
+    side: Side | None = None,
+    scene: str | None = None,
+    scan: str | None = None,
+) -> LabelFiles:
+    """The files of one format that meet the filters. NotFound for the job."""
+    found = published(services, job_id, label_format)
+    listed = list(found.files(found.manifest(services.store)))
+    for name, wanted in (("scene", scene), ("scan", scan)):
+        if wanted is not None:
+            listed = [file for file in listed if file.get(name) == wanted]
+            if not listed:
+                remedy = f"Use a {name} that GET /v1/jobs/{job_id}/labels names."
+                raise invalid(f"query {name}", f"the job has no labels of a {name} {wanted!r}", remedy)
+    if side is not None:
+        listed = [file for file in listed if side_of(file) == side]
+    documents = [_document(services, file) for file in listed]
+    return LabelFiles(job_id=job_id, format=found.label_format, files=documents)
 
 
-def _no_labels(job: JobRow) -> ApiProblem:
-    if job.state.final:
-        what, remedy = f"The job {job.state.value}, so it has no labels.", "GET the job to see why; submit a new one."
-    else:
-        what, remedy = f"The job is {job.state.value}; labels exist when it has succeeded.", "Ask again then."
-    return conflict("no-labels", "There are no labels", f"{what} {remedy}", where="job", remedy=remedy)
+def url(services: Services, job_id: str, path: str) -> str:
+    """A presigned URL of one file, of whatever format. NotFound for the job, 404 for the file."""
+    manifest = published(services, job_id, None).manifest(services.store)
+    file = next((file for file in manifest["files"] if file["path"] == path), None)
+    if file is None:
+        what, remedy = f"the job has no file {path!r}", f"Use a path that GET /v1/jobs/{job_id}/labels names."
+        error = ErrorItem(where="path", what=what, remedy=remedy)
+        raise ApiProblem(404, "unknown-file", "Unknown file", f"path: {what}. {remedy}", [error])
+    return _presigned(services, file)
+
+
+def _document(services: Services, file: dict[str, Any]) -> LabelFile:
+    return LabelFile(
+        path=file["path"],
+        size=file["size"],
+        sha256=file["sha256"],
+        side=side_of(file),
+        scene=file.get("scene"),
+        scan=file.get("scan"),
+        url=_presigned(services, file),
+    )
+
+
+def _presigned(services: Services, file: dict[str, Any]) -> str:
+    return services.store.presign_get(
+        file["key"], services.settings.url_ttl_seconds, file["path"].rpartition("/")[2]
+    )  # fmt: skip

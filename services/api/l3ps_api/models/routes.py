@@ -23,3 +23,9 @@ def list_models(services: ServicesDep, limit: Limit = 50, cursor: Annotated[Curs
 def get_model(model: str, services: ServicesDep) -> Model:
     """A model by its name or id."""
     return service.get(services, model)
+
+
+@router.delete("/{model}", status_code=204)
+def delete_model(model: str, services: ServicesDep) -> None:
+    """Delete a model, by its name or id, and free its name. Refused while a job uses it; labels made with it stay."""
+    service.delete(services, model)

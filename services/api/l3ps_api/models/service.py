@@ -19,3 +19,9 @@ def get(services: Services, model: str) -> Model:
     """One model by name or id. NotFound."""
     with services.catalog.reading() as session:
         return Model.of(bundles.by_name(session, model))
+
+
+def delete(services: Services, model: str) -> None:
+    """Hide a model at once; the reconciler deletes its archive. NotFound, Conflict while in use."""
+    with services.catalog.transaction() as tx:
+        bundles.delete(tx, bundles.by_name(tx.session, model).id)

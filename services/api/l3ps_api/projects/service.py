@@ -6,6 +6,7 @@ from l3ps_api.keyring import Principal
 from l3ps_api.projects.schemas import KeyRef, Me, Project, ProjectPage, ProjectRef
 from l3ps_api.services import Services
 from l3ps_platform.catalog import keys, projects
+from l3ps_platform.catalog.requests import note_result
 
 
 def me(services: Services, principal: Principal) -> Me:
@@ -23,7 +24,9 @@ def me(services: Services, principal: Principal) -> Me:
 def create(services: Services, name: str) -> Project:
     """A new project. Conflict when the name is taken."""
     with services.catalog.transaction() as tx:
-        return Project.of(projects.add(tx, name))
+        row = projects.add(tx, name)
+        note_result(tx.session, "projects", row.id)
+        return Project.of(row)
 
 
 def page(services: Services, limit: int, cursor: str | None) -> ProjectPage:

@@ -41,7 +41,7 @@ def get_training(training_id: str, services: ServicesDep) -> Training:
 
 @router.post("/trainings/{training_id}/cancel", status_code=202)
 def cancel_training(training_id: str, services: ServicesDep) -> Training:
-    """Ask a training to stop, which it does within seconds. One that is over stays as it is."""
+    """Ask a training to stop, which it does within seconds. Refused when it has succeeded or failed."""
     return service.cancel(services, training_id)
 
 

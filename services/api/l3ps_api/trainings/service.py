@@ -18,6 +18,7 @@ from l3ps_api.trainings.schemas import (
     summary_fields,
 )
 from l3ps_platform.catalog import JobState, UploadState, annotation_sets, bundles, stages, trainings, uploads
+from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import Conflict, NotFound, ObjectMissing
 from l3ps_platform.ids import is_id
 from l3ps_platform.workflow import cancel_training, retry_training, submit_training
@@ -89,9 +90,12 @@ def get(services: Services, training_id: str) -> Training:
 
 
 def cancel(services: Services, training_id: str) -> Training:
-    """Ask a training to stop. NotFound."""
+    """Ask a training to stop; one that is cancelled stays so. NotFound, Conflict when it came to another end."""
     with services.catalog.transaction() as tx:
-        cancel_training(tx, training_id)
+        state = cancel_training(tx, training_id).state
+        if state in (JobState.SUCCEEDED, JobState.FAILED):
+            raise Conflict(f"training {training_id} has {state} already: there is nothing left to cancel")
+        note_result(tx.session, "trainings", training_id)
     return get(services, training_id)
 
 
@@ -99,6 +103,7 @@ def retry(services: Services, training_id: str) -> Training:
     """Run a failed or cancelled training again. NotFound, Conflict for another."""
     with services.catalog.transaction() as tx:
         retry_training(tx, training_id)
+        note_result(tx.session, "trainings", training_id)
     return get(services, training_id)
 
 

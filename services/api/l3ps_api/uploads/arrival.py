@@ -51,7 +51,7 @@ def _compare(services: Services, row: UploadRow, arrived: Sequence[Part], comple
         remedy = "POST …/parts for their URLs, PUT them, and complete the upload again."
         raise invalid("parts", what, remedy, code="invalid-parts")
     for part in arrived:
-        wanted = part_length(part.number, row.size, services.settings) if part.number <= row.parts else 0
+        wanted = part_length(part.number, row, services.settings)
         if part.size != wanted:
             what = f"part {part.number} has {part.size} bytes, {wanted} were announced"
             return invalid("size", what, "Upload the file again; nothing was kept.", code="wrong-size")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from l3ps_platform.catalog import UploadRow
 from l3ps_platform.settings import MiB, Settings
 
 MAX_PARTS = 10_000
@@ -19,10 +20,15 @@ def part_count(size: int, settings: Settings) -> int:
     return max(1, -(-size // part_size(size, settings)))
 
 
-def part_length(number: int, size: int, settings: Settings) -> int:
-    """Bytes of one part, numbered from 1, of a file of ``size`` bytes."""
-    each = part_size(size, settings)
-    return min(each, size - (number - 1) * each)
+def size_of_parts(row: UploadRow, settings: Settings) -> int:
+    """Bytes of every part but the last of an upload, whatever the settings say by now."""
+    return row.part_size or part_size(row.size, settings)
+
+
+def part_length(number: int, row: UploadRow, settings: Settings) -> int:
+    """Bytes of one part of an upload, numbered from 1; 0 or less for one that it does not have."""
+    each = size_of_parts(row, settings)
+    return min(each, row.size - (number - 1) * each)
 
 
 def largest_part(settings: Settings) -> int:

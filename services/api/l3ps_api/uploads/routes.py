@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Response
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.models.schemas import Model
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_api.uploads import service
 from l3ps_api.uploads.schemas import (
     Completion,
@@ -38,7 +38,7 @@ def open_upload(request: UploadRequest, response: Response, services: ServicesDe
 def list_uploads(
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("upl")] = None,
     state: Annotated[UploadState | None, Query(description="Only uploads in this state.")] = None,
 ) -> UploadPage:
     """Uploads, newest first; `state=open` finds those that a client left unfinished."""

@@ -15,7 +15,7 @@ from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
 from l3ps_api.uploads.arrival import join
-from l3ps_api.uploads.parts import part_count, part_length, part_size
+from l3ps_api.uploads.parts import part_count, part_length, part_size, size_of_parts
 from l3ps_api.uploads.schemas import (
     Completion,
     OpenUpload,
@@ -85,6 +85,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 size=request.size,
                 sha256=request.sha256,
                 parts=count,
+                part_size=part_size(request.size, settings),
                 object_key=key,
                 s3_upload_id=multipart,
                 seconds=seconds,
@@ -93,7 +94,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
         services.store.abort_multipart(key, multipart)
         raise
     urls = _presigned(services, row, range(1, count + 1))
-    return OpenUpload(**_fields(row), part_size=part_size(row.size, settings), parts=urls)
+    return OpenUpload(**_fields(row), part_size=row.part_size, parts=urls)
 
 
 def opened(services: Services, upload_id: str) -> OpenUpload:
@@ -123,9 +124,9 @@ def get(services: Services, upload_id: str) -> UploadProgress:
             received = [
                 ReceivedPart(number=part.number, size=part.size, etag=part.etag)
                 for part in services.store.list_parts(row.object_key, row.s3_upload_id)
-                if part.size is not None and part.size == part_length(part.number, row.size, services.settings)
+                if part.size is not None and part.size == part_length(part.number, row, services.settings)
             ]
-    each = part_size(row.size, services.settings)
+    each = size_of_parts(row, services.settings)
     return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received)
 
 
@@ -137,7 +138,7 @@ def urls(services: Services, upload_id: str, numbers: Iterable[int]) -> PartUrls
     if wanted[-1] > row.parts:
         what = f"the upload has the parts 1 to {row.parts}, {wanted[-1]} is none of them"
         raise invalid("numbers", what, "Ask for parts that `received` of the upload lacks.", code="invalid-parts")
-    return PartUrls(part_size=part_size(row.size, services.settings), parts=_presigned(services, row, wanted))
+    return PartUrls(part_size=size_of_parts(row, services.settings), parts=_presigned(services, row, wanted))
 
 
 def abort(services: Services, upload_id: str) -> None:
@@ -206,7 +207,7 @@ def _presigned(services: Services, row: UploadRow, numbers: Iterable[int]) -> li
     seconds = int((row.expires_at - datetime.now(UTC)).total_seconds())
     seconds = max(1, min(seconds, services.settings.upload_ttl_seconds, MAX_SECONDS))
     store, settings = services.store, services.settings
-    sized = [(number, part_length(number, row.size, settings)) for number in numbers]
+    sized = [(number, part_length(number, row, settings)) for number in numbers]
     return [
         PartUrl(number=number, url=store.presign_part(row.object_key, row.s3_upload_id, number, seconds, length))
         for number, length in sized

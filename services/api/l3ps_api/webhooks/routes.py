@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
-from l3ps_api.services import Cursor, Limit, ServicesDep
+from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_api.webhooks import service
 from l3ps_api.webhooks.schemas import (
     Delivery,
@@ -34,7 +34,9 @@ def create_webhook(request: WebhookRequest, response: Response, services: Servic
 
 
 @router.get("")
-def list_webhooks(services: ServicesDep, limit: Limit = 50, cursor: Cursor = None) -> WebhookPage:
+def list_webhooks(
+    services: ServicesDep, limit: Limit = 50, cursor: Annotated[Cursor, id_of("whk")] = None
+) -> WebhookPage:
     """Webhooks, newest first."""
     return service.page(services, limit, cursor)
 
@@ -80,7 +82,7 @@ def list_deliveries(
     webhook_id: str,
     services: ServicesDep,
     limit: Limit = 50,
-    cursor: Cursor = None,
+    cursor: Annotated[Cursor, id_of("msg")] = None,
     state: Annotated[DeliveryState | None, Query(description="Only deliveries in this state.")] = None,
 ) -> DeliveryPage:
     """The deliveries to a webhook with their attempts, newest first. The log goes back 30 days unless set otherwise."""

@@ -18,8 +18,11 @@ def _known(pattern: str) -> str:
 
 _kinds = f"{', '.join(EventKind)}; groups such as `job.*`. None: all of them."
 Patterns = Annotated[list[Annotated[str, AfterValidator(_known)]], Field(max_length=40, description=_kinds)]
-Url = Annotated[str, Field(max_length=2000, description="Where to send to: https, and a public address.")]
-Text = Annotated[str, Field(max_length=200)]
+_PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
+Url = Annotated[
+    str, Field(max_length=2000, pattern=_PRINTABLE, description="Where to send to: https, and a public address.")
+]
+Text = Annotated[str, Field(max_length=200, pattern=_PRINTABLE)]
 
 
 class WebhookRequest(BaseModel):

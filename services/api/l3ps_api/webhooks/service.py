@@ -17,6 +17,7 @@ from l3ps_api.webhooks.schemas import (
     WebhookRequest,
 )
 from l3ps_platform.catalog import DeliveryState, WebhookRow, webhooks
+from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import TargetRefused
 from l3ps_platform.ids import new_id
 from l3ps_platform.webhooks import Guard, new_secret
@@ -45,6 +46,12 @@ def create(services: Services, request: WebhookRequest) -> NewWebhook:
         tx.session.add(row)
         tx.session.flush()
         return _with_secret(row)
+
+
+def shown_again(services: Services, webhook_id: str) -> NewWebhook:
+    """The answer of a request that was cut off after it had made a webhook. NotFound."""
+    with services.catalog.reading() as session:
+        return _with_secret(webhooks.get(session, webhook_id))
 
 
 def page(services: Services, limit: int, cursor: str | None) -> WebhookPage:
@@ -92,6 +99,7 @@ def rotate(services: Services, webhook_id: str, overlap_seconds: int) -> NewWebh
         else:
             row.previous_secret = row.previous_until = None
         row.secret = new_secret()
+        note_result(tx.session, "webhooks", webhook_id)
         return _with_secret(row)
 
 

@@ -1,0 +1,1 @@
+"""What the scenarios stand on: servers to kill, a proxy that injects faults, a workload, a stack and checks."""

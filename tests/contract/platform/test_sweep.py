@@ -1,0 +1,347 @@
+"""What is deleted goes from the store, what anybody needs stays; on both databases, with real threads."""
+
+import os
+import threading
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+
+from l3ps_platform import workflow
+from l3ps_platform.catalog import (
+    Catalog,
+    DriveRow,
+    JobRow,
+    OutputRow,
+    ProjectRow,
+    StageName,
+    bundles,
+    drives,
+    jobs,
+    outputs,
+    retention,
+)
+from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.errors import Conflict, LeaseLost, NotFound, OutputDoomed, StoreUnavailable
+from l3ps_platform.objects import DirectoryStore
+from l3ps_platform.settings import Settings
+
+PROJECT = "prj_default"
+
+
+class House:
+    """Jobs whose stages make real objects under content-addressed keys, and the sweep."""
+
+    def __init__(self, catalog: Catalog, play, sent, store: DirectoryStore) -> None:
+        self.catalog, self.play, self.sent, self.store = catalog, play, sent, store
+
+    def job(self, content: str = "a", *, size: int = 100) -> str:
+        """A finished job over one scene; equal ``content`` means equal outputs."""
+        id = self.play.submit(scenes=1)
+        self.finish(content, size=size)
+        return id
+
+    def finish(self, content: str, *, size: int = 100) -> None:
+        while self.sent:
+            claim = self.play.take()
+            key = f"stages/{PROJECT}/{claim.name.value}-{content}"
+            if claim.name is StageName.PUBLISH:
+                key = f"jobs/{claim.job_id}"
+                self.store.put_bytes(f"{key}/poses.txt", b"poses")
+                self.end(claim, f"{key}/manifest.json")
+                continue
+            self.pin(claim, key)
+            self.store.put_bytes(f"{key}/part-1.bin", b"x" * size)
+            self.end(claim, f"{key}/{outputs.MAIN[claim.name]}", size)
+
+    def pin(self, claim, key: str) -> None:
+        with self.catalog.transaction() as tx:
+            workflow.pin_output(tx, claim, key)
+
+    def end(self, claim, main: str, size: int = 0) -> None:
+        self.store.put_bytes(main, b"{}")
+        with self.catalog.transaction() as tx:
+            workflow.complete(tx, claim, workflow.Cost(1.0), output_key=main)
+            workflow.note_output(tx, main.rpartition("/")[0], size)
+
+    def delete(self, *ids: str) -> None:
+        with self.catalog.transaction() as tx:
+            for id in ids:
+                jobs.delete(tx, id)
+
+    def age(self, row: type, id: str, **since: float) -> None:
+        with self.catalog.transaction() as tx:
+            found = tx.session.get_one(row, id)
+            if row is JobRow:
+                found.finished_at = tx.now - timedelta(**since)
+            else:
+                found.created_at = tx.now - timedelta(**since)
+
+    def sweep(self, **settings) -> dict[str, int]:
+        return workflow.Sweeper(self.catalog, self.store, Settings(**settings)).run_once()
+
+    def groups(self, prefix: str = "") -> set[str]:
+        return {info.key.rpartition("/")[0] for info in self.store.list(prefix)}
+
+
+@pytest.fixture
+def house(catalog: Catalog, play, sent, tmp_path: Path) -> House:
+    store = DirectoryStore(tmp_path / "store", "")
+    store.ensure()
+    return House(catalog, play, sent, store)
+
+
+def stage_keys(content: str) -> set[str]:
+    return {f"stages/{PROJECT}/segment-{content}", f"stages/{PROJECT}/refine-{content}"}
+
+
+def test_a_deleted_job_leaves_nothing_in_the_store_but_stays_in_the_figures(house) -> None:
+    job = house.job()
+    assert house.groups() == stage_keys("a") | {f"jobs/{job}"}
+    house.delete(job)
+    with house.catalog.reading() as session:
+        with pytest.raises(NotFound):
+            jobs.get(session, job)
+        assert jobs.page(session) == []
+        assert session.get(JobRow, job).quality is None and len(jobs.scenes(session, job)) == 1
+    assert house.sweep()["outputs"] == 2
+    assert house.groups() == set()
+    with house.catalog.reading() as session:
+        assert outputs.doomed(session, 10) == [] and session.get(OutputRow, f"stages/{PROJECT}/refine-a") is None
+    assert house.sweep()["jobs"] == 0
+
+
+def test_what_another_job_uses_too_stays_until_that_is_gone_as_well(house) -> None:
+    first, second = house.job("shared"), house.job("shared")
+    house.delete(first)
+    house.sweep()
+    assert house.groups() == stage_keys("shared") | {f"jobs/{second}"}
+    house.delete(second)
+    house.sweep()
+    assert house.groups() == set()
+
+
+def test_what_an_unfinished_job_has_pinned_stays(house) -> None:
+    old = house.job("same")
+    house.play.submit(scenes=1)
+    claim = house.play.take()
+    house.pin(claim, f"stages/{PROJECT}/segment-same")
+    house.delete(old)
+    house.sweep()
+    assert house.groups() == {f"stages/{PROJECT}/segment-same"}
+    house.end(claim, f"stages/{PROJECT}/segment-same/primal.npz")
+
+
+def test_only_a_job_that_is_over_can_be_deleted_and_only_once(house) -> None:
+    job = house.play.submit(scenes=1)
+    with pytest.raises(Conflict, match="cancel it first"):
+        house.delete(job)
+    house.finish("x")
+    house.delete(job)
+    with pytest.raises(NotFound):
+        house.delete(job)
+
+
+def test_a_doomed_output_is_refused_until_it_is_gone_and_then_made_anew(house) -> None:
+    house.delete(house.job("d"))
+    house.store.delete_prefix = _away  # the store goes away between the two halves of the deletion
+    with pytest.raises(StoreUnavailable):
+        house.sweep()
+    del house.store.delete_prefix
+    house.play.submit(scenes=1)
+    claim = house.play.take()
+    key = f"stages/{PROJECT}/segment-d"
+    with house.catalog.transaction() as tx:
+        workflow.doom_output(tx, key)
+    with pytest.raises(OutputDoomed):
+        house.pin(claim, key)
+    house.sweep()
+    house.pin(claim, key)
+    assert not house.store.exists(f"{key}/primal.npz"), "what is pinned now is empty, not half"
+
+
+def _away(_: str) -> int:
+    raise StoreUnavailable("away")
+
+
+def test_a_stage_that_was_lost_pins_nothing(house) -> None:
+    house.play.submit(scenes=1)
+    claim = house.play.take()
+    with house.catalog.transaction() as tx:
+        workflow.release(tx, claim)
+    with pytest.raises(LeaseLost):
+        house.pin(claim, f"stages/{PROJECT}/segment-x")
+
+
+def test_pinning_and_dooming_at_once_never_lose_an_output(house) -> None:
+    """Whoever comes second sees the first: a pin that succeeded finds everything there or nothing, and keeps it."""
+    key = f"stages/{PROJECT}/segment-r"
+    outcomes = set()
+    for _ in range(6):
+        old = house.job("r")
+        house.play.submit(scenes=1)
+        claim = house.play.take()
+        house.delete(old)
+        barrier = threading.Barrier(3)
+        seen: dict[str, object] = {}
+
+        def work(claim=claim, barrier=barrier, seen=seen) -> None:
+            barrier.wait()
+            while True:
+                try:
+                    house.pin(claim, key)
+                    break
+                except OutputDoomed:
+                    seen["refused"] = True
+            seen["cached"] = house.store.exists(f"{key}/primal.npz")
+            if not seen["cached"]:
+                house.store.put_bytes(f"{key}/part-1.bin", b"x" * 100)
+            house.end(claim, f"{key}/primal.npz")
+
+        def sweep(barrier=barrier) -> None:
+            barrier.wait()
+            for _ in range(3):
+                house.sweep()
+
+        threads = [threading.Thread(target=target) for target in (work, sweep, sweep)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert {info.key for info in house.store.list(f"{key}/")} == {f"{key}/part-1.bin", f"{key}/primal.npz"}, seen
+        outcomes.add((seen["cached"], "refused" in seen))
+        house.finish("r")
+    assert outcomes
+
+
+def test_a_model_is_deleted_with_its_archive_and_its_name_is_free(house) -> None:
+    job = house.job()
+    with house.catalog.reading() as session:
+        model, drive = jobs.get(session, job).model_id, jobs.get(session, job).drive_id
+        name = bundles.get(session, model).name
+    house.store.put_bytes("uploads/u/m.zip", b"model")
+    busy = house.play.submit(scenes=1)
+    with house.catalog.reading() as session:
+        used = jobs.get(session, busy).model_id
+    with pytest.raises(Conflict, match="is used by job"), house.catalog.transaction() as tx:
+        bundles.delete(tx, used)
+    with house.catalog.transaction() as tx:
+        bundles.delete(tx, model)
+        with pytest.raises(NotFound):
+            workflow.submit_job(tx, drive_id=drive, model=model)
+        assert bundles.named(tx.session, name) is None
+    house.sweep()
+    assert "uploads/u" not in house.groups()
+    with house.catalog.reading() as session:
+        assert jobs.get(session, job).model_id == model, "labels made with it stay"
+
+
+def test_what_nobody_owns_goes_after_a_day_and_what_somebody_owns_stays(house) -> None:
+    job = house.job()
+    orphans = {
+        f"stages/{PROJECT}/refine-dead",
+        "stages/prj_gone/segment-x",
+        "uploads/upl_x",
+        "jobs/job_x",
+        "trainings/trn_x",
+    }
+    for key in orphans:
+        house.store.put_bytes(f"{key}/file", b"x")
+    lost = house.store.create_multipart("uploads/upl_y/archive")
+    house.sweep()
+    house.sweep()
+    assert house.groups() == orphans | stage_keys("a") | {f"jobs/{job}"}, "it may be somebody's in a moment"
+    for path in house.store.root.rglob("*"):
+        os.utime(path, (0, 0))
+    house.sweep()
+    house.sweep()
+    assert house.groups() == stage_keys("a") | {f"jobs/{job}"}
+    assert lost not in {pending.upload_id for pending in house.store.list_multipart()}
+
+
+def test_retention_by_age_takes_the_old_and_nothing_that_is_in_use(house) -> None:
+    old, new = house.job("old"), house.job("new")
+    with house.catalog.transaction() as tx:
+        retention.put(tx, max_age_days=30, max_bytes=None)
+    house.age(JobRow, old, days=31)
+    with house.catalog.reading() as session:
+        old_drive, new_drive = (jobs.get(session, id).drive_id for id in (old, new))
+    for drive in (old_drive, new_drive):
+        house.age(DriveRow, drive, days=31)
+    busy = house.play.submit(scenes=1)
+    with house.catalog.reading() as session:
+        busy_drive = jobs.get(session, busy).drive_id
+    house.age(DriveRow, busy_drive, days=31)
+    assert house.sweep()["expired_jobs"] == 2
+    assert house.groups() >= stage_keys("new") and not house.groups() & stage_keys("old")
+    with house.catalog.reading() as session:
+        assert drives.get(session, new_drive) and drives.get(session, busy_drive)
+        with pytest.raises(NotFound):
+            drives.get(session, old_drive)
+
+
+def test_retention_by_size_takes_the_oldest_until_it_fits(house) -> None:
+    made = [house.job(name, size=1000) for name in ("one", "two", "three")]
+    for days, job in zip((3, 2, 1), made, strict=True):
+        house.age(JobRow, job, days=days)
+    with house.catalog.transaction() as tx:
+        retention.put(tx, max_age_days=None, max_bytes=4500)
+    house.sweep()
+    kept = {name for name in ("one", "two", "three") if stage_keys(name) <= house.groups()}
+    assert kept == {"two", "three"}, "6 kB of outputs and three drives of 9 bytes: one job is enough"
+    with house.catalog.transaction() as tx:
+        retention.put(tx, max_age_days=None, max_bytes=None)
+    assert house.sweep()["expired_jobs"] == 0
+
+
+def test_labels_of_a_deleted_project_go(house) -> None:
+    job = house.job()
+    with house.catalog.transaction() as tx:
+        tx.session.get_one(ProjectRow, PROJECT).deleted_at = tx.now
+    assert house.sweep()["expired_jobs"] == 1
+    assert house.groups() == set(), job
+
+
+def test_one_sweeps_at_a_time(house) -> None:
+    house.delete(house.job())
+    with house.catalog.alone("sweep") as mine:
+        assert mine
+        assert house.sweep() == {}
+    assert house.sweep()["outputs"] == 2
+
+
+def test_outputs_of_before_they_were_counted_are_not_taken_for_orphans(empty_url: str, tmp_path: Path) -> None:
+    catalog = Catalog(empty_url).scoped(PROJECT)
+    upgrade(empty_url, "0003")
+    with catalog.transaction() as tx:
+        for statement in _OLD_ROWS:
+            tx.session.execute(text(statement))
+    upgrade(empty_url)
+    store = DirectoryStore(tmp_path / "store", "")
+    for key in ("stages/refine-old/scene.json", "stages/refine-old/refined/x.bin"):
+        store.put_bytes(key, b"x")
+        os.utime(store.path_of(key), (0, 0))
+    sweeper = workflow.Sweeper(catalog, store, Settings())
+    sweeper.run_once()
+    sweeper.run_once()
+    assert len(list(store.list())) == 2
+    with catalog.transaction() as tx:
+        jobs.delete(tx, "job_1")
+    workflow.Sweeper(catalog, store, Settings()).run_once()
+    assert list(store.list()) == []
+    catalog.dispose()
+
+
+_DATE = "'2026-01-01 00:00:00+00:00'"
+_OLD_ROWS = (
+    "INSERT INTO drives (id, project_id, name, filename, size, state, created_at) "
+    f"VALUES ('drv_1', 'prj_default', 'd', 'd.zip', 9, 'ready', {_DATE})",
+    "INSERT INTO models (id, project_id, name, filename, size, state, created_at) "
+    f"VALUES ('mdl_1', 'prj_default', 'm', 'm.zip', 9, 'ready', {_DATE})",
+    "INSERT INTO jobs (id, project_id, drive_id, model_id, settings, state, cancel_requested, created_at, finished_at) "
+    f"VALUES ('job_1', 'prj_default', 'drv_1', 'mdl_1', '{{}}', 'succeeded', false, {_DATE}, {_DATE})",
+    "INSERT INTO stages (id, job_id, name, queue, state, attempt, progress_done, progress_total, fraction, cached, "
+    "output_key, finished_at) VALUES ('stg_1', 'job_1', 'refine', 'refine', 'done', 1, 0, 0, 1, false, "
+    f"'stages/refine-old/scene.json', {_DATE})",
+)
