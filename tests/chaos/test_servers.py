@@ -78,9 +78,11 @@ class Outage:
 def test_store_down(scenario, ends_well, method: str, pattern: str, nth: list[int]) -> None:
     """kill -9 of the object store at a certain request, started again after 4 s; no attempt is used up."""
     outage = Outage()
-    service = scenario(rules=[Rule(method, pattern, nth, before=outage)])
+    rule = Rule(method, pattern, nth, before=outage, armed=False)
+    service = scenario(rules=[rule])
     outage.service = service
     service.begin()
+    rule.armed = True  # the API looks into what was uploaded, too
     service.start_worker(concurrency=2)
     ends_well(service)
     assert outage.happened
@@ -116,9 +118,11 @@ def test_store_slow(scenario, ends_well) -> None:
 def test_store_truncates(scenario, ends_well) -> None:
     """Bodies that end half way: of archives, the model, primal labels and manifests."""
     patterns = {r"uploads/.*": [1, 3], r"primal\.npz": [1, 4], r"scene\.json": [30, 33]}
-    rules = [Rule("GET", pattern, nth, truncate=True) for pattern, nth in patterns.items()]
+    rules = [Rule("GET", pattern, nth, truncate=True, armed=False) for pattern, nth in patterns.items()]
     service = scenario(rules=rules)
     service.begin()
+    for rule in rules:
+        rule.armed = True
     service.start_worker(concurrency=2)
     service.at_work("segment")
     ends_well(service)

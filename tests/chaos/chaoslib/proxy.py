@@ -24,6 +24,7 @@ class Rule:
         before: called before the request is passed on, ``after`` when its answer is there and the client waits for it.
         delay: seconds before it is passed on.
         truncate: the answer's body ends half way, and with it the connection.
+        armed: whether it acts and counts at all yet.
     """
 
     method: str
@@ -33,11 +34,12 @@ class Rule:
     after: Callable[[], None] | None = None
     delay: float = 0.0
     truncate: bool = False
+    armed: bool = True
     seen: int = field(default=0, init=False)
     hits: int = field(default=0, init=False)
 
     def takes(self, method: str, path: str) -> bool:
-        if method != self.method or not re.search(self.pattern, path):
+        if not self.armed or method != self.method or not re.search(self.pattern, path):
             return False
         self.seen += 1
         if self.nth and self.seen not in self.nth:
