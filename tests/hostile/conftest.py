@@ -29,9 +29,12 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
     return Samples(read_folder(folder), small_bundle())
 
 
-@pytest.fixture(scope="session", params=["embedded", "servers"])
+@pytest.fixture(scope="session", params=["embedded", "servers"] if FULL else ["servers"])
 def service(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """The service as ``l3ps up`` runs it, and on PostgreSQL, MinIO and a Redis server; not the one of other tests."""
+    """The service as ``l3ps up`` runs it, and on PostgreSQL, MinIO and a Redis server; not the one of other tests.
+
+    Each takes ten seconds to start, so that only ``make hostile`` takes both.
+    """
     data = tmp_path_factory.mktemp("hostile")
     embedded, servers = partial(api._embedded, training=False), partial(api._servers, redis_database=2)
     start = embedded if request.param == "embedded" else servers

@@ -169,12 +169,14 @@ class Postgres:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def wait_until(ready: Callable[[], object], otherwise: str, seconds: float = STARTS_WITHIN) -> object:
+def wait_until(
+    ready: Callable[[], object], otherwise: str, seconds: float = STARTS_WITHIN, pause: float = 0.02
+) -> object:
     """Poll until something is true; its value."""
     deadline = time.monotonic() + seconds
     while not (found := ready()):
         assert time.monotonic() < deadline, otherwise
-        time.sleep(0.02)
+        time.sleep(pause)
     return found
 
 

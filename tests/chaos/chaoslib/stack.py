@@ -228,7 +228,7 @@ class Service:
         def over() -> bool:
             return all(job.state.final for job in self.all_jobs()) and not self.stages(~_final())
 
-        wait_until(over, "not every job came to an end", seconds)
+        wait_until(over, "not every job came to an end", seconds, pause=0.3)  # it reads every row
         self.note("seconds to the end", round(time.monotonic() - started, 1))
 
     def states(self) -> dict[str, JobState]:

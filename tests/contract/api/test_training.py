@@ -111,7 +111,7 @@ def test_trainings_are_listed_and_shown(service, command, trained):
     assert trained["id"] in [item["id"] for item in items]
     code, out, _ = command("trainings", trained["id"])
     assert code == 0 and "six-pictures from six over scratch" in out
-    assert 'l3ps_trainings{state="succeeded"}' in service.http.get("/metrics").text
+    assert 'l3ps_trainings{project="prj_default",state="succeeded"}' in service.http.get("/metrics").text
 
 
 @pytest.mark.once

@@ -10,6 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import structlog
+from structlog.testing import capture_logs
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import JobState, StageState, annotation_sets, bundles, stages, trainings
@@ -103,6 +105,15 @@ def test_a_training_becomes_a_model_with_its_report(direct, desk: Desk) -> None:
 def _steps(bench, stage) -> list:
     with bench.catalog.reading() as session:
         return stages.steps(session, [stage.id])[stage.id]
+
+
+def test_what_the_trainer_says_stands_in_the_worker_s_log_under_the_training_s_ids(direct, desk: Desk) -> None:
+    with capture_logs([structlog.contextvars.merge_contextvars]) as lines:
+        id = desk.start()
+        direct.run()
+    said = [line for line in lines if line["event"] == "trainer"]
+    assert [line["line"] for line in said] == desk.log(id).splitlines()
+    assert {(line["training"], line["kind"], line["attempt"]) for line in said} == {(id, "train", 1)}
 
 
 def test_a_trained_model_labels_a_drive(direct, desk: Desk, short_zip: Path) -> None:

@@ -88,9 +88,10 @@ def test_a_worker_listens_to_each_queue():
 
 
 def test_torch_comes_only_to_those_who_ask_for_it():
-    """One profile brings the image with the trainer; what everybody starts has no profile."""
+    """One profile brings the image with the trainer, one a dashboard; what everybody starts has no profile."""
     assert {name: service["profiles"] for name, service in SERVICES.items() if "profiles" in service} == {
-        "worker-train": ["train"]
+        "worker-train": ["train"],
+        "grafana": ["grafana"],
     }
     assert SERVICES["worker-train"]["build"]["target"] == "worker-train"
     assert SERVICES["api"]["environment"]["L3PS_TRAINING"] == "${L3PS_TRAINING:-0}"
