@@ -215,6 +215,41 @@ def test_pinning_and_dooming_at_once_never_lose_an_output(house) -> None:
     assert outcomes
 
 
+def blocked_or_over(catalog: Catalog, thread: threading.Thread) -> None:
+    """Wait until a thread's transaction waits for a lock, or did not have to."""
+    while thread.is_alive() and catalog.engine.dialect.name == "postgresql":
+        with catalog.reading() as session:
+            if session.scalar(text("SELECT count(*) FROM pg_locks WHERE NOT granted")):
+                return
+
+
+@pytest.mark.parametrize("first", ["pin", "doom"])
+def test_of_two_that_meet_the_second_waits_and_sees_what_the_first_did(house, first: str) -> None:
+    key = f"stages/{PROJECT}/segment-m"
+    house.delete(house.job("m"))
+    house.play.submit(scenes=1)
+    claim = house.play.take()
+    seen = []
+
+    def act(tx, name: str) -> None:
+        try:
+            seen.append((name, workflow.pin_output(tx, claim, key) if name == "pin" else workflow.doom_output(tx, key)))
+        except OutputDoomed:
+            seen.append((name, "refused"))
+
+    def second() -> None:
+        with house.catalog.transaction() as tx:
+            act(tx, "doom" if first == "pin" else "pin")
+
+    thread = threading.Thread(target=second)
+    with house.catalog.transaction() as tx:
+        act(tx, first)
+        thread.start()
+        blocked_or_over(house.catalog, thread)
+    thread.join()
+    assert seen == ([("pin", None), ("doom", False)] if first == "pin" else [("doom", True), ("pin", "refused")])
+
+
 def test_a_model_is_deleted_with_its_archive_and_its_name_is_free(house) -> None:
     job = house.job()
     with house.catalog.reading() as session:
