@@ -16,6 +16,6 @@ router = APIRouter(prefix="/v1/notifications", tags=["arrival"])
 def notify(notification: Notification, services: ServicesDep, principal: PrincipalDep) -> Noted:
     """Take an S3 event notification. Each new object that meets a rule becomes one job, however often it is told of.
 
-    MinIO's webhook target and AWS' events (through SNS or EventBridge with an HTTP target) can send here as they are.
+    MinIO's webhook target sends such events as they are; from AWS, have a small function POST them.
     """
     return service.take(services, principal.project_id, notification)
