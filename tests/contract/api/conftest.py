@@ -303,7 +303,8 @@ class Played:
         with catalog.transaction() as tx:
             drive = drives.add(tx, name="played", **file)
             drive.state = DriveState.READY
-            drive.info = {"scenes": [{"name": f"scene-{n}", "scans": 1, "points": 5} for n in range(scenes)]}
+            named = [{"name": f"scene-{n}", "scans": 1, "points": 5} for n in range(scenes)]
+            drive.info = {"scenes": named, "scans": scenes, "points": 5 * scenes, "has_truth": False}
             model = bundles.add(tx, name=f"played-{secrets.token_hex(4)}", **file)
             model.state, model.info = ModelState.READY, {}
             tx.session.flush()
