@@ -18,11 +18,10 @@ Cause, cause_of                why an attempt failed, in one word
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.workflow.again import outputs_to_keep, retry_job, retry_training
 from l3ps_platform.workflow.arrivals import settle_arrivals
+from l3ps_platform.workflow.attempts import Cost
 from l3ps_platform.workflow.causes import Cause, cause_of, disk_is_full, failure
 from l3ps_platform.workflow.claims import Claim, check_cancelled, claim, prolong, report
 from l3ps_platform.workflow.outcomes import (
-    Cost,
-    Retry,
     cancel_job,
     cancelled,
     complete,
@@ -42,6 +41,7 @@ from l3ps_platform.workflow.planning import (
     submit_job,
 )
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
+from l3ps_platform.workflow.retries import Retry
 from l3ps_platform.workflow.sweep import Sweeper
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 import structlog
 from sqlalchemy import update
@@ -12,13 +12,34 @@ from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 
-if TYPE_CHECKING:
-    from l3ps_platform.workflow.outcomes import Cost
-
 log = structlog.get_logger(__name__)
 
 UNKNOWN = "unknown"
 _FAILURES = (Outcome.FAILED, Outcome.RETRIED, Outcome.LOST)
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What an attempt cost and how much it did.
+
+    Attributes:
+        seconds: wall time.
+        cpu_seconds: processor time of the process, all threads.
+        peak_mb: peak resident memory, MB.
+        scans, points: what was processed.
+        bytes: what an ingest took in and other stages stored.
+        cached: the output was there already and nothing was computed.
+        steps: (seconds, peak MB) of each step inside the stage.
+    """
+
+    seconds: float
+    cpu_seconds: float = 0.0
+    peak_mb: float = 0.0
+    scans: int = 0
+    points: int = 0
+    bytes: int = 0
+    cached: bool = False
+    steps: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def note_end(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from datetime import datetime, timedelta
 
 from sqlalchemy import delete, select, update
 
@@ -17,61 +15,13 @@ from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
-from l3ps_platform.settings import Settings
 from l3ps_platform.workflow import notices
-from l3ps_platform.workflow.attempts import note_again, note_end, note_figures
-from l3ps_platform.workflow.causes import Cause, failure, stored_cause
+from l3ps_platform.workflow.attempts import Cost, note_again, note_end, note_figures
+from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
+from l3ps_platform.workflow.retries import Retry, next_try
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """What an attempt cost and how much it did.
-
-    Attributes:
-        seconds: wall time.
-        cpu_seconds: processor time of the process, all threads.
-        peak_mb: peak resident memory, MB.
-        scans, points: what was processed.
-        bytes: what an ingest took in and other stages stored.
-        cached: the output was there already and nothing was computed.
-        steps: (seconds, peak MB) of each step inside the stage.
-    """
-
-    seconds: float
-    cpu_seconds: float = 0.0
-    peak_mb: float = 0.0
-    scans: int = 0
-    points: int = 0
-    bytes: int = 0
-    cached: bool = False
-    steps: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Retry:
-    """How often and how long a stage may be tried.
-
-    Attributes:
-        max_attempts: how often it may fail by a fault of its own: a crash, too little memory, a bug.
-        seconds: the wait before the second time; it doubles each time.
-        outage_seconds: how long it is tried while what it stands on is away; that uses up no attempt.
-        longest_seconds: the longest wait between two tries.
-    """
-
-    max_attempts: int
-    seconds: float
-    outage_seconds: float = 6 * 3600.0
-    longest_seconds: float = 60.0
-
-    @classmethod
-    def of(cls, settings: Settings) -> Retry:
-        """As the service's settings have it."""
-        return cls(
-            settings.max_attempts, settings.retry_seconds, settings.outage_seconds, settings.outage_retry_seconds
-        )
 
 
 def complete(
@@ -187,7 +137,7 @@ def failed(tx: Transaction, stage: StageRow, retry: Retry | None, again: Outcome
         stage.state, stage.error = StageState.CANCELLED, failure(_WAS_CANCELLED, Cause.CANCELLED)
         cancel_rest_of_scene(tx, stage, StageState.CANCELLED)
         settle(tx, parent)
-    elif retry is not None and (moment := _next_try(tx, stage, retry)) is not None:
+    elif retry is not None and (moment := next_try(tx, stage, retry)) is not None:
         note_again(tx, stage, again)
         stage.state, stage.not_before, stage.finished_at = StageState.WAITING, moment, None
         stage.attempt += 1
@@ -292,20 +242,6 @@ _OUTCOMES = {
     StageState.CANCELLED: Outcome.CANCELLED,
 }
 """What the end of an attempt is called that left its stage in this state."""
-
-
-def _next_try(tx: Transaction, stage: StageRow, retry: Retry) -> datetime | None:
-    """Count a failure by its cause and say when the stage may run again; None for never."""
-    if stored_cause(stage.error).environmental:
-        stage.outage_since = stage.outage_since or tx.now
-        lasted = (tx.now - stage.outage_since).total_seconds()
-        wait = max(lasted, retry.seconds)  # as long as it has lasted: the waits double
-        return None if lasted >= retry.outage_seconds else tx.now + timedelta(seconds=min(wait, retry.longest_seconds))
-    stage.outage_since = None
-    stage.failures += 1
-    if stage.failures >= retry.max_attempts:
-        return None
-    return tx.now + timedelta(seconds=retry.seconds * 2 ** (stage.failures - 1))
 
 
 def _rejection(problems: Sequence[Problem]) -> Json:

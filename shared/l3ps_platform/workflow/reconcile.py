@@ -25,8 +25,9 @@ from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
-from l3ps_platform.workflow.outcomes import Retry, failed
+from l3ps_platform.workflow.outcomes import failed
 from l3ps_platform.workflow.planning import enqueue
+from l3ps_platform.workflow.retries import Retry
 from l3ps_platform.workflow.sweep import Sweeper
 
 if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it

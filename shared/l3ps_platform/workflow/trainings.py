@@ -13,8 +13,9 @@ from l3ps_platform.catalog.states import JobState, ModelState, StageName, StageS
 from l3ps_platform.errors import Conflict, LeaseLost
 from l3ps_platform.ids import new_id
 from l3ps_platform.workflow import notices
+from l3ps_platform.workflow.attempts import Cost
 from l3ps_platform.workflow.claims import Claim, changed, owned
-from l3ps_platform.workflow.outcomes import Cost, cancelled, fail, finish
+from l3ps_platform.workflow.outcomes import cancelled, fail, finish
 from l3ps_platform.workflow.planning import add_stage, enqueue
 from l3ps_platform.workflow.settling import settle_training
 
