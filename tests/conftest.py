@@ -9,6 +9,7 @@ import importlib.util
 import os
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -21,6 +22,10 @@ from typing import Any, NoReturn
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# Where the whole run was started in a shell's background it ignores Ctrl-C, and so would every process it starts: the
+# tests that press Ctrl-C would find nobody listening.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 STARTS_WITHIN = 30.0
 
 

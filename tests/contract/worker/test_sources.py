@@ -180,6 +180,5 @@ def test_deleting_a_drive_by_reference_leaves_the_bucket_alone(bench, bucket):
     drive = checked(bench, f"s3://{bucket.name}/logs/street")
     with bench.catalog.transaction() as tx:
         drives.delete(tx, drive.id)
-    reconciler = workflow.Reconciler(bench.context.catalog, bench.context.queue, bench.store, bench.settings)
-    assert reconciler._delete_archives() == 0
+    workflow.Sweeper(bench.context.catalog, bench.store, bench.settings).run_once()
     assert bucket.content() == before
