@@ -13,6 +13,7 @@ from datetime import datetime, timedelta
 from itertools import groupby, islice
 
 import structlog
+from sqlalchemy import update
 
 from l3ps_platform.catalog import annotation_sets, belongings, bundles, drives, jobs, outputs, trainings, uploads
 from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, JobRow, ModelRow, UploadRow
@@ -21,6 +22,7 @@ from l3ps_platform.catalog.states import OutputState, StageName, UploadState
 from l3ps_platform.errors import Conflict, StoreError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.claims import changed
 from l3ps_platform.workflow.expiry import expire
 from l3ps_platform.workflow.pins import doom_output
 
@@ -92,8 +94,10 @@ class Sweeper:
             if key and not shared:
                 self._store.delete(key)
             with self._catalog.transaction() as tx:
-                tx.session.merge(row, load=True).object_key = None
-                tx.session.flush()
+                # The row as it is now: it may have been deleted, or given way to another, since it was read.
+                table = type(row)
+                gone = update(table).where(table.id == row.id, table.object_key == row.object_key)
+                changed(tx, gone.values(object_key=None))
                 if shared:
                     doom_output(tx, belongings.group_of(key))
                 count += 1

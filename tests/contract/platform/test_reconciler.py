@@ -102,6 +102,22 @@ def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     assert not tidy.store.exists("uploads/u/d.zip")
 
 
+def test_a_drive_deleted_while_its_archive_is_swept_stays_deleted(tidy, play, monkeypatch, catalog: Catalog) -> None:
+    rejected = play.drive(usable=False)
+    delete = tidy.store.delete
+
+    def meanwhile(key: str) -> None:
+        with catalog.transaction() as tx:
+            drives.delete(tx, rejected)
+        delete(key)
+
+    monkeypatch.setattr(tidy.store, "delete", meanwhile)
+    assert tidy().archives == 1
+    with catalog.reading() as session:
+        swept = drives.many(session, [rejected])[rejected]
+    assert swept.deleted_at is not None and swept.object_key is None
+
+
 def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -> None:
     rejected, deleted, kept = play.drive(usable=False), play.drive(), play.drive()
     for drive, key in ((rejected, "a/1"), (deleted, "a/2"), (kept, "a/3")):
