@@ -26,11 +26,16 @@ log = structlog.get_logger(__name__)
 
 def ingest(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     """Check an uploaded drive or model; a bad one is rejected with its problems and its archive deleted."""
+    if claim.drive_id is not None:
+        with context.catalog.reading() as session:
+            drive = drives.many(session, [claim.drive_id])[claim.drive_id]
+        return _ingest_drive(
+            context, drive, progress
+        )  # an open session would hold back vacuum and migrations for hours
+    assert claim.model_id is not None
     with context.catalog.reading() as session:
-        if claim.drive_id is not None:
-            return _ingest_drive(context, drives.many(session, [claim.drive_id])[claim.drive_id], progress)
-        assert claim.model_id is not None
-        return _ingest_model(context, bundles.get(session, claim.model_id), progress)
+        model = bundles.get(session, claim.model_id)
+    return _ingest_model(context, model, progress)
 
 
 def _ingest_drive(context: Context, row: DriveRow, progress: Progress) -> Done:

@@ -157,12 +157,13 @@ class Catalog:
 
     @contextmanager
     def _session(self, *, write: bool) -> Iterator[Session]:
-        with _CatalogSession(self.engine, expire_on_commit=False, info={"project": self._project}) as session:
-            try:
+        try:
+            # Inside, because a session whose server has gone fails at its close as well.
+            with _CatalogSession(self.engine, expire_on_commit=False, info={"project": self._project}) as session:
                 session.connection(execution_options={"l3ps_write": write})
                 yield session
-            except (OperationalError, InterfaceError) as error:
-                raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+        except (OperationalError, InterfaceError) as error:
+            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
 
     def now(self, session: Session) -> datetime:
         """The database server's time."""

@@ -3,9 +3,11 @@
 import threading
 from datetime import timedelta
 
+import psycopg
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
 from l3ps.errors import DriveLogError, ModelError, Problem
@@ -28,6 +30,7 @@ from l3ps_platform.catalog import (
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.catalog.session import make_engine
 from l3ps_platform.errors import CatalogUnavailable, Conflict, NotFound
+from l3ps_platform.settings import Settings
 
 SPOILT = Problem("truncated-scan", "samples/x.bin", "it ends after 3 bytes", "Copy it again.", "scan", "scene-0", "x")
 BROKEN = Problem("no-calibration", "calib.txt", "it is missing", "Add it.")
@@ -151,6 +154,15 @@ def test_a_database_that_is_away() -> None:
     away = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none")
     with pytest.raises(CatalogUnavailable, match="does not answer"):
         away.ping()
+
+
+def test_a_database_that_goes_while_a_session_is_open(postgres_url: str) -> None:
+    catalog = Catalog(Settings(database_url=postgres_url).catalog_url)
+    with pytest.raises(CatalogUnavailable, match="does not answer"), catalog.reading() as session:
+        backend = session.scalar(text("SELECT pg_backend_pid()"))
+        with psycopg.connect(postgres_url, autocommit=True) as other:
+            other.execute("SELECT pg_terminate_backend(%s)", [backend])
+    catalog.dispose()
 
 
 class TestDrives:
