@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -26,7 +26,10 @@ class JobSettings(BaseModel):
         description="How images are looked at: in one pass, in one of higher resolution where the model has a graph "
         "for it, or in the published tilings.",
     )
-    formats: Annotated[list[LabelFormat], Field(min_length=1, description="Label formats to write.")] = ["nuscenes"]
+    formats: Annotated[
+        list[LabelFormat],
+        Field(min_length=1, max_length=len(get_args(LabelFormat)), description="Label formats to write."),
+    ] = ["nuscenes"]
     protocol: Protocol | None = Field(
         default=None, description="Protocol of the quality figures; default: the one that belongs to the log's truth."
     )
