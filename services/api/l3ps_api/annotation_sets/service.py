@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from l3ps_api.annotation_sets.schemas import Annotations, AnnotationsPage
+from l3ps_api.pages import cut
 from l3ps_api.services import Services
 from l3ps_platform.catalog import annotation_sets
 
@@ -11,8 +12,7 @@ def page(services: Services, limit: int, cursor: str | None, sha256: str | None)
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = annotation_sets.page(session, limit=limit + 1, before=cursor, sha256=sha256)
-    shown = rows[:limit]
-    following = shown[-1].id if len(rows) > limit else None
+    shown, following = cut(rows, limit)
     return AnnotationsPage(items=[Annotations.of(row) for row in shown], next=following)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from l3ps_api.drives.schemas import Drive, DrivePage
+from l3ps_api.pages import cut
 from l3ps_api.services import Services
 from l3ps_platform.catalog import drives
 
@@ -11,8 +12,8 @@ def page(services: Services, limit: int, cursor: str | None, sha256: str | None)
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = drives.page(session, limit=limit + 1, before=cursor, sha256=sha256)
-    shown = rows[:limit]
-    return DrivePage(items=[Drive.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return DrivePage(items=[Drive.of(row) for row in shown], next=following)
 
 
 def get(services: Services, drive_id: str) -> Drive:

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from l3ps.errors import InputError
 from l3ps_api.jobs.schemas import Job, JobPage, JobRequest, JobSummary, Scene, Stage, Step, summary_fields
 from l3ps_api.limits import over_quota
+from l3ps_api.pages import cut
 from l3ps_api.problems import ApiProblem, invalid, items
 from l3ps_api.services import Services
 from l3ps_api.sources import permitted
@@ -64,7 +65,7 @@ def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = jobs.page(session, wanted, limit=limit + 1, before=cursor)
-        shown = rows[:limit]
+        shown, following = cut(rows, limit)
         of_drive = drives.many(session, [row.drive_id for row in shown])
         of_model = bundles.many(session, [row.model_id for row in shown])
         progress = stages.progress(session, [row.id for row in shown])
@@ -76,7 +77,7 @@ def page(services: Services, limit: int, cursor: str | None, wanted: jobs.Wanted
         )
         for row in shown
     ]
-    return JobPage(items=summaries, next=shown[-1].id if len(rows) > limit else None)
+    return JobPage(items=summaries, next=following)
 
 
 def get(services: Services, job_id: str) -> Job:

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 from l3ps_api.keyring import digest, new_secret
 from l3ps_api.keys.schemas import Key, KeyPage, KeyRequest, KeyWithSecret
+from l3ps_api.pages import cut
 from l3ps_api.problems import invalid
 from l3ps_api.services import Services
 from l3ps_platform.catalog import ApiKeyRow, keys
@@ -31,8 +32,8 @@ def page(services: Services, limit: int, cursor: str | None) -> KeyPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = keys.page(session, limit=limit + 1, before=cursor)
-    shown = rows[:limit]
-    return KeyPage(items=[Key.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return KeyPage(items=[Key.of(row) for row in shown], next=following)
 
 
 def get(services: Services, key_id: str) -> Key:

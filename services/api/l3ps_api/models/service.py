@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from l3ps_api.models.schemas import Model, ModelPage
+from l3ps_api.pages import cut
 from l3ps_api.services import Services
 from l3ps_platform.catalog import bundles
 
@@ -11,8 +12,8 @@ def page(services: Services, limit: int, cursor: str | None) -> ModelPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = bundles.page(session, limit=limit + 1, before=cursor)
-    shown = rows[:limit]
-    return ModelPage(items=[Model.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return ModelPage(items=[Model.of(row) for row in shown], next=following)
 
 
 def get(services: Services, model: str) -> Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from l3ps_api.keyring import Principal
+from l3ps_api.pages import cut
 from l3ps_api.projects.schemas import KeyRef, Me, Project, ProjectPage, ProjectRef
 from l3ps_api.services import Services
 from l3ps_platform.catalog import keys, projects
@@ -33,8 +34,8 @@ def page(services: Services, limit: int, cursor: str | None) -> ProjectPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = projects.page(session, limit=limit + 1, before=cursor)
-    shown = rows[:limit]
-    return ProjectPage(items=[Project.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return ProjectPage(items=[Project.of(row) for row in shown], next=following)
 
 
 def get(services: Services, project_id: str) -> Project:

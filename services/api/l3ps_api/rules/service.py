@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from l3ps_api.pages import cut
 from l3ps_api.problems import conflict
 from l3ps_api.rules.schemas import Rule, RulePage, RuleRequest
 from l3ps_api.services import Services
@@ -33,10 +34,10 @@ def page(services: Services, limit: int, cursor: str | None) -> RulePage:
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = rules.page(session, limit=limit + 1, before=cursor)
-        shown = rows[:limit]
+        shown, following = cut(rows, limit)
         seen = rules.arrived(session, [row.id for row in shown])
     items = [Rule.of(row, *seen.get(row.id, (0, None))) for row in shown]
-    return RulePage(items=items, next=shown[-1].id if len(rows) > limit else None)
+    return RulePage(items=items, next=following)
 
 
 def get(services: Services, rule_id: str) -> Rule:

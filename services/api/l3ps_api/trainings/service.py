@@ -7,6 +7,7 @@ from contextlib import suppress
 from sqlalchemy.orm import Session
 
 from l3ps_api.jobs.service import check_active_jobs, stage_document
+from l3ps_api.pages import cut
 from l3ps_api.problems import ApiProblem, conflict, invalid
 from l3ps_api.services import Services
 from l3ps_api.trainings.schemas import (
@@ -62,12 +63,12 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = trainings.page(session, limit=limit + 1, before=cursor, state=state)
-        shown = rows[:limit]
+        shown, following = cut(rows, limit)
         sets = annotation_sets.many(session, [id for row in shown for id in (row.annotations_id, row.validation_id)])
         models = bundles.many(session, [row.model_id or "" for row in shown])
         work = stages.of_trainings(session, [row.id for row in shown])
     items = [TrainingSummary(**summary_fields(row, sets, models, work[row.id].fraction)) for row in shown]
-    return TrainingPage(items=items, next=shown[-1].id if len(rows) > limit else None)
+    return TrainingPage(items=items, next=following)
 
 
 def get(services: Services, training_id: str) -> Training:

@@ -12,6 +12,7 @@ from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
 from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
+from l3ps_api.pages import cut
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
 from l3ps_api.uploads.arrival import join
@@ -109,9 +110,9 @@ def page(services: Services, limit: int, cursor: str | None, state: UploadState 
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = uploads.page(session, limit=limit + 1, before=cursor, state=state)
-    shown = rows[:limit]
+    shown, following = cut(rows, limit)
     items = [Upload(**_fields(row)) for row in shown]
-    return UploadPage(items=items, next=shown[-1].id if len(rows) > limit else None)
+    return UploadPage(items=items, next=following)
 
 
 def get(services: Services, upload_id: str) -> UploadProgress:

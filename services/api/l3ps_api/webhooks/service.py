@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta
 
+from l3ps_api.pages import cut
 from l3ps_api.problems import conflict, invalid
 from l3ps_api.services import Services
 from l3ps_api.webhooks.schemas import (
@@ -58,8 +59,8 @@ def page(services: Services, limit: int, cursor: str | None) -> WebhookPage:
     """One page, newest first."""
     with services.catalog.reading() as session:
         rows = webhooks.page(session, limit=limit + 1, before=cursor)
-    shown = rows[:limit]
-    return WebhookPage(items=[Webhook.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return WebhookPage(items=[Webhook.of(row) for row in shown], next=following)
 
 
 def get(services: Services, webhook_id: str) -> Webhook:
@@ -116,8 +117,8 @@ def log(
     with services.catalog.reading() as session:
         webhooks.get(session, webhook_id)
         rows = webhooks.deliveries(session, webhook_id, limit=limit + 1, before=cursor, state=state)
-    shown = rows[:limit]
-    return DeliveryPage(items=[Delivery.of(row) for row in shown], next=shown[-1].id if len(rows) > limit else None)
+    shown, following = cut(rows, limit)
+    return DeliveryPage(items=[Delivery.of(row) for row in shown], next=following)
 
 
 def replay(services: Services, webhook_id: str, delivery_id: str) -> Delivery:
