@@ -6,16 +6,10 @@ from collections import Counter
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
-import pytest
 from chaoslib.servers import wait_until
 from chaoslib.workload import CASES
 
 from l3ps_platform.catalog import JobState, StageRow, StageState
-
-
-def offered(service, path: str) -> bool:
-    """Whether the API has a route at all."""
-    return path in service.http.get("/openapi.json").json()["paths"]
 
 
 def test_api_killed_in_upload(scenario, ends_well) -> None:
@@ -54,8 +48,6 @@ def test_api_killed_in_events(scenario, ends_well) -> None:
     """kill -9 of the API while clients follow jobs by server-sent events; they reconnect with Last-Event-ID."""
     service = scenario()
     service.begin()
-    if not offered(service, "/v1/jobs/{job_id}/events"):
-        pytest.skip("pending: GET /v1/jobs/{id}/events is not there yet")
     jobs = list(service.jobs)[:3]
     seen: dict[str, list[tuple[str, str]]] = {job: [] for job in jobs}
     followers = [threading.Thread(target=follow, args=(service, job, seen[job])) for job in jobs]
@@ -155,8 +147,6 @@ def test_same_post_twice(scenario, ends_well) -> None:
     for thread in threads:
         thread.join()
     created = len(service.all_jobs())
-    if created == 2 * len(CASES):
-        pytest.skip("pending: Idempotency-Key is not honoured yet")
     assert created == len(CASES)
     for n, pair in answers.items():
         made = {answer.json()["id"] for answer in pair if answer.is_success}
@@ -213,8 +203,6 @@ def test_webhook_receivers(scenario, ends_well) -> None:
     service = scenario(webhook_allow="127.0.0.1/32", webhook_http=True, webhook_retry_seconds="0,0.2,0.5,1,2")
     try:
         service.begin()
-        if not offered(service, "/v1/webhooks"):
-            pytest.skip("pending: /v1/webhooks is not there yet")
         wanted = {"events": ["job.succeeded"]}
         made = {name: service.post("/v1/webhooks", url=one.url, **wanted)["id"] for name, one in receivers.items()}
         service.start_worker(concurrency=2)

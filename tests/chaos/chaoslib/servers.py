@@ -8,6 +8,7 @@ import signal
 import subprocess
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,7 +25,7 @@ _starter = ThreadPoolExecutor(1)
 ROOT = Path(__file__).resolve().parents[3]
 
 
-class Server:
+class Server(ABC):
     """A server on a loopback port of its own."""
 
     def __init__(self, folder: Path) -> None:
@@ -32,11 +33,13 @@ class Server:
         self.process: Child | None = None
         folder.mkdir(parents=True, exist_ok=True)
 
+    @abstractmethod
     def command(self) -> list[str]:
-        raise NotImplementedError
+        """What to start."""
 
+    @abstractmethod
     def ready(self) -> bool:
-        raise NotImplementedError
+        """Whether it answers."""
 
     def environment(self) -> dict[str, str]:
         return dict(os.environ)
