@@ -17,9 +17,9 @@ def test_points_of_workers(scenario, ends_well) -> None:
     of stage, and of its main process to 3."""
     service = scenario(points={"*": 40, "main": 3}, max_attempts=100, progress_seconds=0.4)
     service.begin()
+    service.note_in_flight()
     service.start_worker("w1", concurrency=2)
     service.start_worker("w2", concurrency=2)
-    service.at_work()
     service.keep_up(service.over, 300)
     service.start_worker("w3")  # whose start sweeps the scratch of what the last of the dead left
     died = _note(service)
@@ -43,8 +43,8 @@ def test_points_of_the_api(scenario, ends_well) -> None:
     assert len(service.all_jobs()) == len(service.jobs) == len(CASES), "a job was made twice, or not at all"
     made = [len(service.rows(kind)) for kind in (DriveRow, ModelRow, UploadRow, WebhookRow)]
     assert made == [6, 1, 7, 1], made
+    service.note_in_flight()
     service.start_worker(concurrency=2)
-    service.at_work()
     service.keep_up(lambda: service.over() and service.heard(), 300)
     wait_until(lambda: not service.multipart_uploads(), "an upload that nobody knows stays in the store", 90)
     died = _note(service)

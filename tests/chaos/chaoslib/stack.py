@@ -168,6 +168,11 @@ class Service:
         wait_until(lambda: not child.running(), "it survived SIGKILL")
         self.processes.children.remove(child)
 
+    def stop(self, child: Child) -> None:
+        """SIGTERM, and wait."""
+        child.stop()
+        self.processes.children.remove(child)
+
     def left(self, child: Child) -> int | None:
         """The status of a child that was asked to leave, once it has."""
         wait_until(lambda: not child.running(), f"{child.name} did not leave", 60)
@@ -218,6 +223,21 @@ class Service:
         answer = self._insist(path, headers, body) if self.patient else self.http.post(path, json=body, headers=headers)
         assert answer.is_success, f"{answer.status_code}: {answer.text}"
         return dict(answer.json())
+
+    def put_json(self, path: str, **body: Any) -> None:
+        answer = self.http.put(path, json=body)
+        assert answer.is_success, f"{answer.status_code}: {answer.text}"
+
+    def delete(self, path: str) -> bool:
+        """Delete something, as often as it takes; whether it was there."""
+        deadline = time.monotonic() + ANSWERS_WITHIN
+        while True:
+            with suppress(httpx.TransportError):
+                answer = self.http.delete(path)
+                if answer.status_code not in _AGAIN:
+                    return answer.is_success or answer.status_code == 404  # the first try's answer may be lost
+            assert time.monotonic() < deadline, f"DELETE {path}: no answer"
+            time.sleep(0.1)
 
     def _insist(self, path: str, headers: dict[str, str] | None, body: Any) -> httpx.Response:
         """As a client does whose answer may get lost: the same again under one key, until there is an answer."""
