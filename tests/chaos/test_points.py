@@ -30,9 +30,9 @@ def test_points_of_workers(scenario, ends_well) -> None:
 
 
 def test_points_of_the_api(scenario, ends_well) -> None:
-    """kill -9 of the API right before and right after its n-th commit and message: while it answers (n to 6), in its
+    """kill -9 of the API right before and right after its n-th commit and message: while it answers (n to 4), in its
     reconciler and its deliverer (n to 3). Clients try again with the key they used."""
-    limits = {"requests": 6, "reconciler": 3, "deliverer": 3}
+    limits = {"requests": 4, "reconciler": 3, "deliverer": 3}
     # An upload that was begun in the store and never known to the catalog is an orphan of that age.
     swept = {"orphan_seconds": 20.0, "orphans_every_seconds": 2.0, "upload_ttl_seconds": 20}
     service = scenario(points=limits, idempotency_lease_seconds=2.0, **swept)
