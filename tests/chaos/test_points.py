@@ -4,7 +4,9 @@ What the other scenarios try by hand at a few moments, these do at all of them (
 """
 
 import threading
+import time
 from collections import Counter
+from collections.abc import Callable
 
 from chaoslib.servers import wait_until
 from chaoslib.workload import CASES
@@ -20,7 +22,7 @@ def test_points_of_workers(scenario, ends_well) -> None:
     service.note_in_flight()
     service.start_worker("w1", concurrency=2)
     service.start_worker("w2", concurrency=2)
-    service.keep_up(service.over, 300)
+    _keep_up(service, service.over)
     service.start_worker("w3")  # whose start sweeps the scratch of what the last of the dead left
     died = _note(service)
     ends_well(service)
@@ -39,18 +41,24 @@ def test_points_of_the_api(scenario, ends_well) -> None:
     service.start_api()
     clients = threading.Thread(target=service.fill)
     clients.start()
-    service.keep_up(lambda: not clients.is_alive(), 200)
+    service.keep_up(lambda: not clients.is_alive(), 400)
     assert len(service.all_jobs()) == len(service.jobs) == len(CASES), "a job was made twice, or not at all"
     made = [len(service.rows(kind)) for kind in (DriveRow, ModelRow, UploadRow, WebhookRow)]
     assert made == [6, 1, 7, 1], made
     service.note_in_flight()
     service.start_worker(concurrency=2)
-    service.keep_up(lambda: service.over() and service.heard(), 300)
+    _keep_up(service, lambda: service.over() and service.heard())
     wait_until(lambda: not service.multipart_uploads(), "an upload that nobody knows stays in the store", 90)
     died = _note(service)
     ends_well(service)
     for life, least in {"requests": 7, "reconciler": 2, "deliverer": 5}.items():
         assert died[life] >= least, died
+
+
+def _keep_up(service, done: Callable[[], object]) -> None:
+    began = time.monotonic()
+    service.keep_up(done, 600)
+    service.note("seconds to the end", round(time.monotonic() - began, 1))
 
 
 def _note(service) -> Counter[str]:
