@@ -28,7 +28,6 @@ from l3ps_worker.arrays import read_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import refine_key
 from l3ps_worker.outputs import pin
-from l3ps_worker.segment import primal_key
 from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work, sha256_of
 
 log = structlog.get_logger(__name__)
@@ -52,7 +51,8 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     budget = max(1, context.settings.refine_bytes // BYTES_A_POINT)
     max_points = budget if work.scene.points > budget else None
     wanted = work.job.settings
-    prefix = refine_key(primal_key(work), work.preset, wanted["formats"], wanted["protocol"], max_points)
+    assert work.primal is not None, "a refine stage is queued when its scene's segment stage is done"
+    prefix = refine_key(work.primal, work.preset, wanted["formats"], wanted["protocol"], max_points)
     manifest_key = f"{prefix}/{SCENE_MANIFEST}"
     pin(context, claim, prefix, progress)
     try:
@@ -62,7 +62,7 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
         pass
     book = CostBook()
     with opened_scene(context, work, progress) as (drive, scene), context.scratch.workdir() as folder:
-        primal = _primal(context, work, folder)
+        primal = _primal(context, work.primal, folder)
         refined = refine_scene(
             scene,
             primal,
@@ -113,11 +113,11 @@ def _done(
     return Done(finish, work.scene.scans, work.scene.points, stored, cached=cached, steps=steps or {})
 
 
-def _primal(context: Context, work: SceneWork, folder: Path) -> list[ScanLabels]:
+def _primal(context: Context, key: str, folder: Path) -> list[ScanLabels]:
     try:
-        context.store.get_file(primal_key(work), folder / "primal.npz")
+        context.store.get_file(key, folder / "primal.npz")
     except ObjectMissing:
-        raise ProcessingError("the scene's primal labels are gone from the store: submit the job again") from None
+        raise ProcessingError("the scene's primal labels are gone from the store: retry the job") from None
     return read_labels(folder / "primal.npz")
 
 
