@@ -163,7 +163,7 @@ def _error(caught: Exception) -> Json:
     cause = workflow.cause_of(caught)
     if isinstance(caught, TrainerLost):
         return workflow.failure(str(caught), workflow.Cause.CRASHED)
-    if cause is workflow.Cause.OUT_OF_MEMORY:
+    if cause is workflow.Cause.OUT_OF_MEMORY and not isinstance(caught, L3psError):
         message = "the worker ran out of memory; use smaller scenes or a worker with more memory"
         return workflow.failure(message, cause)
     if cause is workflow.Cause.DISK_FULL:

@@ -55,12 +55,14 @@ def complete(
         scene = tx.session.get_one(SceneRow, stage.scene_id)
         if quality is not None:
             scene.quality = quality
-        waiting = [s for s in stages.of_scene(tx.session, scene.id) if s.state is StageState.WAITING]
-        if waiting and not job.cancel_requested:
-            enqueue(tx, waiting[0])
-        elif not waiting:
+        rest = [other for other in stages.of_scene(tx.session, scene.id) if other.state is not StageState.DONE]
+        if not rest:
             scene.state = StageState.DONE
             notices.of_scene(tx, job, scene, stage)
+        elif job.cancel_requested:
+            scene.state = StageState.CANCELLED
+        elif rest[0].state is StageState.WAITING:
+            enqueue(tx, rest[0])
     settle_job(tx, job)
 
 

@@ -16,9 +16,11 @@ import pytest
 from l3ps.drivelog import open_drive
 from l3ps.evaluate import evaluate_drive
 from l3ps.labels import open_labels, read_poses
+from l3ps.segment import check
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs, stages
 from l3ps_platform.errors import CatalogUnavailable, StoreUnavailable
+from l3ps_platform.workflow.planning import enqueue
 from l3ps_worker import runner
 
 
@@ -210,6 +212,26 @@ def test_a_model_whose_graph_does_not_load_is_rejected(direct, fast_model: Path,
     model = direct.upload_model(zip_of(tmp_path / "m.zip", {"model.json": info, "model.onnx": b"garbage"}))
     direct.run()
     assert "it is no ONNX graph" in direct.model(model).problem["problems"][0]["what"]
+
+
+def test_a_model_whose_trial_the_machine_ends_is_tried_again(direct, fast_model: Path, monkeypatch, tmp_path) -> None:
+    """For memory that others hold, say: nothing that its owner could mend."""
+    killed = tmp_path / "killed"
+    killed.write_text("#!/bin/sh\nkill -KILL $$\n")
+    killed.chmod(0o755)
+    model = direct.upload_model(fast_model)
+    message = direct.sent[0]
+    with monkeypatch.context() as patched:
+        patched.setattr(check.sys, "executable", str(killed))
+        assert direct.step() == "failed"
+    with direct.catalog.reading() as session:
+        stage = stages.get(session, message.stage_id)
+    assert (stage.state, stage.error["cause"], stage.failures) == (StageState.WAITING, "out-of-memory", 1)
+    assert "use one with more" in stage.error["message"]
+    with direct.catalog.transaction() as tx:
+        enqueue(tx, stages.get(tx.session, stage.id))
+    assert direct.run() == ["done"]
+    assert direct.model(model).state is ModelState.READY
 
 
 class TestStopping:
