@@ -27,6 +27,8 @@ TASK_NAMES = {name: f"l3ps.{name.value}" for name in StageName}
 
 _UNACKED, _UNACKED_INDEX = "unacked", "unacked_index"
 """Where kombu keeps the messages that were delivered and not acknowledged."""
+_READ = 1000
+"""Messages read at a time, a kB each: 100,000 at once would be 100 MB in the API and hold Redis up for all others."""
 
 
 def make_app(settings: Settings) -> Celery:
@@ -111,10 +113,16 @@ class Queue:
             return {name: self._redis.llen(name.value) for name in QueueName}
 
     def pending(self, queue: QueueName) -> set[tuple[str, int]]:
-        """The (stage id, attempt) of every message waiting in a queue."""
+        """The (stage id, attempt) of every message that waits in a queue from the beginning of the call to its end."""
+        found: set[tuple[str, int]] = set()
+        first = 0
         with _RedisErrors():
-            raw = cast("list[bytes]", self._redis.lrange(queue.value, 0, -1))
-        return {pair for message in raw if (pair := _identity(message)) is not None}
+            # New messages come in before the first and move the others on, so that some are read twice and none is
+            # passed over; what is taken leaves at the end.
+            while raw := cast("list[bytes]", self._redis.lrange(queue.value, first, first + _READ - 1)):
+                found.update(pair for message in raw if (pair := _identity(message)) is not None)
+                first += len(raw)
+        return found
 
     def delivered(self) -> dict[str, tuple[str, int]]:
         """The (stage id, attempt) of every message that a worker took and has not acknowledged, by its tag.

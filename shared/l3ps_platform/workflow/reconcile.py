@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import structlog
@@ -16,8 +16,8 @@ from sqlalchemy import ColumnElement, select, update
 
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import StageRow
-from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
-from l3ps_platform.catalog.states import QueueName, StageName, StageState
+from l3ps_platform.catalog.session import Catalog, Transaction
+from l3ps_platform.catalog.states import StageName, StageState
 from l3ps_platform.errors import CatalogUnavailable, PlatformError
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
@@ -27,6 +27,7 @@ from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import failed
 from l3ps_platform.workflow.planning import enqueue
+from l3ps_platform.workflow.resending import Resender
 from l3ps_platform.workflow.retries import Retry
 from l3ps_platform.workflow.sweep import Sweeper
 
@@ -70,6 +71,7 @@ class Reconciler:
         self._queue = queue
         self._settings = settings
         self._sweeper = Sweeper(catalog, store, settings)
+        self._resender = Resender(catalog, queue, settings)
         self._retry = Retry.of(settings)
         self._leases_count_from = float("-inf")
 
@@ -94,7 +96,7 @@ class Reconciler:
         return Report(
             expired=self._expire_leases() + self._end_hanging(),
             retried=self._release_retries(),
-            resent=self._resend(),
+            resent=self._resender.run_once(),
             spent=self._drop_spent(),
             arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs),
             **self._sweeper.run_once(),
@@ -147,21 +149,6 @@ class Reconciler:
                     enqueue(tx, stage)
                     count += 1
         return count
-
-    def _resend(self) -> int:
-        """Send again what waits in the catalog and is not in the queue: lost with Redis, or never sent."""
-        stale = self._now() - timedelta(seconds=self._settings.resend_seconds)
-        overdue = self._ids(StageRow.state == StageState.QUEUED, StageRow.queued_at < stale)
-        if not overdue:
-            return 0
-        on_their_way = {pair for name in QueueName for pair in self._queue.pending(name)}
-        with self._catalog.transaction() as tx:
-            query = select(StageRow).where(StageRow.id.in_(overdue), StageRow.state == StageState.QUEUED)
-            for stage in tx.session.scalars(query.with_for_update(skip_locked=True)):
-                if (stage.id, stage.attempt) not in on_their_way:
-                    stage.queued_at = tx.now
-                    tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
-            return len(tx.outbox)
 
     def _drop_spent(self) -> int:
         """Forget messages that a killed worker left delivered for ever, once there is nothing left to do for them."""

@@ -1,8 +1,10 @@
 """What crashes, lost messages and impatient clients leave behind is put right, on both databases and a real Redis."""
 
 import threading
+from datetime import timedelta
 
 import pytest
+from sqlalchemy import select
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
@@ -13,15 +15,17 @@ from l3ps_platform.catalog import (
     QueueName,
     StageMessage,
     StageName,
+    StageRow,
     StageState,
     UploadState,
     drives,
     uploads,
 )
+from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.errors import QueueUnavailable
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
-from l3ps_platform.workflow import Reconciler, Retry
+from l3ps_platform.workflow import Reconciler, Retry, resending
 
 
 def test_nothing_to_do(tidy, play) -> None:
@@ -96,6 +100,51 @@ def test_a_lost_message_is_sent_again_but_one_that_waits_is_not(tidy, play, sent
     assert tidy(resend_seconds=3600).resent == 0
     assert tidy(resend_seconds=-1).resent == 1
     assert sent == [lost]
+
+
+def test_a_lost_message_is_sent_again_behind_a_backlog_of_any_length(tidy, play, sent) -> None:
+    """Nobody serves the queue `segment`; the message of a drive that came later never left the API."""
+    play.submit(scenes=250)
+    tidy.queue.send(sent)
+    sent.clear()
+    with play.catalog.transaction() as tx:
+        workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
+    (lost,) = sent
+    sent.clear()
+    assert tidy(resend_seconds=-1).resent == 1
+    assert sent == [lost]
+
+
+def test_many_lost_messages_leave_in_portions_and_each_once(tidy, play, sent, catalog, monkeypatch) -> None:
+    monkeypatch.setattr(resending, "BATCH", 4)
+    play.submit(scenes=10)
+    lost = sent.copy()
+    sent.clear()
+    with catalog.transaction() as tx:
+        for message in lost:
+            catalog_stages.get(tx.session, message.stage_id).queued_at = tx.now - timedelta(minutes=1)
+    resenders = [resending.Resender(catalog, tidy.queue, tidy.settings) for _ in range(2)]
+    for resender in resenders:
+        resender._look()  # both see all ten
+    rounds = [resender.run_once() for _ in range(3) for resender in resenders]
+    assert rounds == [4, 0, 4, 0, 2, 0]
+    assert sorted(m.stage_id for m in sent) == [m.stage_id for m in lost]
+
+
+def test_queues_are_read_when_something_is_overdue_and_no_more_often_than_messages_are_sent_again(
+    tidy, play, catalog, monkeypatch
+) -> None:
+    reads = []
+    pending = tidy.queue.pending
+    monkeypatch.setattr(tidy.queue, "pending", lambda name: reads.append(name) or pending(name))
+    reconciler = Reconciler(catalog, tidy.queue, tidy.store, tidy.settings)
+    play.submit(scenes=1)
+    assert (reconciler.run_once().resent, reads) == (0, [])
+    with catalog.transaction() as tx:
+        for stage in tx.session.scalars(select(StageRow).where(StageRow.state == StageState.QUEUED)):
+            stage.queued_at = tx.now - timedelta(minutes=1)
+    late = Reconciler(catalog, tidy.queue, tidy.store, tidy.settings)
+    assert (late.run_once().resent, late.run_once().resent, reads) == (1, 0, ["segment"])
 
 
 def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
