@@ -22,7 +22,8 @@ from l3ps_platform.settings import Settings
 from l3ps_platform.telemetry import bound
 
 PROJECT_HEADER = "L3PS-Project"
-_ADMIN = ("keys", "webhooks", "rules", "retention", "projects")
+_OPERATORS = "projects"
+_ADMIN = ("keys", "webhooks", "rules", "retention", _OPERATORS)
 _VERIFYING = 4
 """Credentials looked up at once: a flood of wrong ones leaves the threads and connections of everybody else alone."""
 _READING = ("GET", "HEAD", "OPTIONS")
@@ -40,14 +41,6 @@ async def authenticate(
 
 
 PrincipalDep = Annotated[Principal, Depends(authenticate)]
-
-
-def operator(principal: PrincipalDep) -> Principal:
-    """The caller, who must be the operator."""
-    if principal.key_id is not None:
-        what = f"projects are the operator's, and {principal.key_id} is an API key"
-        raise _forbidden(what, "Use the operator's token (L3PS_TOKEN).")
-    return principal
 
 
 def guarded(path: str) -> bool:
@@ -82,6 +75,9 @@ class Gate:
         if not principal.may(needed):
             what = f"this needs the scope {needed}, and {principal.key_id} has {principal.scope}"
             raise _forbidden(what, f"Use a key of scope {needed}.", needed)
+        if principal.key_id is not None and _collection(scope["path"]) == _OPERATORS:
+            what = f"projects are the operator's, and {principal.key_id} is an API key"
+            raise _forbidden(what, "Use the operator's token (L3PS_TOKEN).")
         operation = self._operations().at(scope["path"]).get(scope["method"])
         if operation is not None:
             _check_query(operation, scope["query_string"])
@@ -111,9 +107,13 @@ class Gate:
 
 def scope_needed(method: str, path: str) -> KeyScope:
     """What a caller's scope must permit for a request."""
-    if path.split("/")[2] in _ADMIN:
+    if _collection(path) in _ADMIN:
         return "admin"
     return "read" if method in _READING else "write"
+
+
+def _collection(path: str) -> str:
+    return path.split("/")[2]
 
 
 def _bearer_secret(scope: Scope) -> bytes | None:
