@@ -6,7 +6,7 @@ The same code serves the embedded stack, one machine and a cluster; only the URL
 from __future__ import annotations
 
 from functools import lru_cache
-from ipaddress import IPv4Network, IPv6Network
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -74,7 +74,9 @@ class Settings(BaseSettings):
     port: int = 8080
     # The operator's. None: on loopback whoever reaches the service is the operator, elsewhere only API keys get in.
     token: SecretStr | None = None
-    trusted_proxies: str = ""  # addresses whose X-Forwarded-For is believed, comma-separated; empty: nobody's
+    # Addresses and networks whose X-Forwarded-For is believed, comma-separated; empty: nobody's. Behind a proxy that is
+    # not named here all clients share one address, and with it the limit of wrong credentials and the operator's rate.
+    trusted_proxies: str = ""
 
     # What one API key (or, without keys, one address) may ask: 200 clients that each ask once a second under one key
     # must pass, with room for what else they do.
@@ -184,6 +186,16 @@ class Settings(BaseSettings):
     @classmethod
     def _listed(cls, value: object) -> object:
         return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _addresses(cls, value: str) -> str:
+        for part in filter(None, (part.strip() for part in value.split(","))):
+            try:
+                ip_network(part)
+            except ValueError:  # the server would take it for a name that never matches, or `*` for everybody
+                raise ValueError("trusted proxies are addresses or networks, such as 10.0.0.7,172.18.0.0/16") from None
+        return value
 
     @field_validator("database_url")
     @classmethod

@@ -30,6 +30,7 @@ def create_webhook(request: WebhookRequest, response: Response, services: Servic
     """Have a URL told of events from now on. The answer holds the secret that messages are signed with."""
     webhook = service.create(services, request)
     response.headers["Location"] = f"/v1/webhooks/{webhook.id}"
+    response.headers["Cache-Control"] = "no-store"
     return webhook
 
 
