@@ -32,6 +32,7 @@ from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
+from l3ps_api.patience import HangUp
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
@@ -82,13 +83,13 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.services = services
     app.state.keyring = Keyring(settings, catalog)
-    app.state.events = EventHub(catalog)
+    app.state.events = EventHub(catalog, settings.event_streams)
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))
     ProcessCollector(registry=app.state.registry)
     streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
-    streams.set_function(lambda: app.state.events.listeners)
+    streams.set_function(lambda: app.state.events.places.taken)
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -114,6 +115,7 @@ def create_app(settings: Settings) -> FastAPI:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     app.add_middleware(AccessLog)
+    app.add_middleware(HangUp)
     describe(app)
     return app
 

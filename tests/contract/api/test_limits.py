@@ -1,6 +1,8 @@
 """Who asks too much is told when to come back, and nobody else notices."""
 
 import secrets
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -12,14 +14,14 @@ TOKEN = secrets.token_urlsafe(32)
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
 
 
-BURST = 12
+BURST = 16
 
 
 @pytest.fixture(scope="module")
 def strict(api_process, redis_server) -> str:
     """An API that lets each key ask so often, and again after minutes."""
     limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
-    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1"}
+    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1", "event_streams": "4"}
     redis_url = redis_server.removesuffix("/0") + "/4"
     return api_process(
         token=TOKEN, redis_url=redis_url, training="1", trusted_proxies="127.0.0.1", **limits, **quotas
@@ -85,6 +87,26 @@ def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
         assert http.post("/v1/models/train", json=request | {"name": "first"}).status_code == 202
         second = http.post("/v1/models/train", json=request | {"name": "second"})
         assert refused(second, "quota-reached")["errors"][0]["where"] == "jobs"
+
+
+def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_once(fresh, strict):
+    with fresh() as greedy, fresh() as modest, ExitStack() as streams:
+
+        def open_stream(http: httpx.Client) -> httpx.Response:
+            return streams.enter_context(http.stream("GET", "/v1/events"))
+
+        with ThreadPoolExecutor(BURST - 4) as pool:
+            answers = list(pool.map(open_stream, [greedy] * (BURST - 4)))
+        opened = [answer for answer in answers if answer.status_code == 200]
+        assert len(opened) == 2, "half of the four"
+        refusal = next(answer for answer in answers if answer.status_code != 200)
+        refusal.read()
+        refused(refusal, "too-many-streams")
+        assert open_stream(modest).status_code == 200
+        opened[0].close()
+        while "l3ps_event_streams 2.0" not in httpx.get(f"{strict}/metrics").text:
+            pass  # until the service has seen it
+        assert open_stream(greedy).status_code == 200
 
 
 def test_wrong_credentials_are_limited_by_address_and_right_ones_pass_all_the_same(fresh, strict):
