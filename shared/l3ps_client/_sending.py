@@ -20,7 +20,7 @@ from threading import Event, Lock
 from typing import Any, Literal
 
 from l3ps_client._documents import Upload
-from l3ps_client._errors import Damaged, Forbidden, L3psClientError, NotFound, Refused, TooManyRequests
+from l3ps_client._errors import Damaged, Forbidden, L3psClientError, NotFound, Refused
 from l3ps_client._ledger import Ledger, Note
 from l3ps_client._wire import Wire, new_key
 
@@ -34,6 +34,10 @@ FOLDERS = {"drive": "drives", "model": "models", "annotations": "annotations"}
 _BLOCK = 1 << 18
 """Bytes read and sent in one go: httpcore copies what the socket leaves of a block, so larger ones are slower."""
 _URLS_AT_ONCE = 200
+_NOT_THE_UPLOAD = (401, 403, 408, 421, 429)
+"""Refusals of the one who asks, or of the moment: with another key, or later, the same upload goes on."""
+_GOES_ON = ("request-in-progress", "conflict", "invalid-parts")
+"""Refusals that leave the upload as it is: another request has it in hand, or parts are to be sent again."""
 _MD5 = re.compile(r"[0-9a-f]{32}")
 
 
@@ -108,8 +112,9 @@ def _announced(wire: Wire, note: Note, file: Path, size: int, options: Options) 
         note.save(path=str(file.resolve()), name=options.name, key=new_key(), announced=body)
     try:
         upload: Upload = wire.post("/v1/uploads", note.facts["announced"], key=note.facts["key"])
-    except Refused:
-        note.forget()
+    except Refused as error:
+        if error.code not in _GOES_ON:
+            note.forget()
         raise
     note.save(upload_id=upload["id"])
     return upload
@@ -118,7 +123,7 @@ def _announced(wire: Wire, note: Note, file: Path, size: int, options: Options) 
 def _is_final(error: BaseException) -> bool:
     """Whether the same upload would fail again, so that there is nothing to go on with."""
     if isinstance(error, Refused):
-        return error.status < 500 and not isinstance(error, TooManyRequests)
+        return error.status < 500 and error.status not in _NOT_THE_UPLOAD and error.code not in _GOES_ON
     return isinstance(error, Damaged)
 
 
