@@ -217,6 +217,22 @@ def test_an_upload_that_is_complete_is_not_sent_again(service, client, file):
     assert service.puts() == []
 
 
+def test_an_upload_that_was_joined_and_not_recorded_is_completed_and_not_sent_again(service, client, file):
+    """The service was killed between the store's work and its own commit."""
+    service.faults.append(only(lambda _, path: path.endswith("/complete"), DOWN))
+    with pytest.raises(Unreachable):
+        client.drives.upload(file, name="morning")
+    service.faults.clear()
+    service.seen.clear()
+    service.uploads["upl_1"]["joined"] = True
+    told = []
+    assert client.drives.upload(file, name="morning", progress=lambda *done: told.append(done))["id"] == "drv_1"
+    assert service.puts() == []
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert service.uploads["upl_1"]["completion"] == {"name": "morning", "sha256": sha256}
+    assert told == [(file.stat().st_size,) * 2]
+
+
 def test_a_completion_that_takes_long_is_waited_for(service, client, file):
     """Its answer is lost to a proxy's patience; the service says that it is still at it, more often than one tries."""
     answers = [BUSY] * 20 + [(504,)]
