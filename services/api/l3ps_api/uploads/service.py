@@ -71,7 +71,8 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/archive"  # nothing of the client's: what it calls the file is the row's
     seconds = min(settings.upload_ttl_seconds, MAX_SECONDS)
-    multipart = services.store.create_multipart(key)
+    each = part_size(request.size, settings)
+    multipart = services.store.create_multipart(key, each)
     try:
         with services.catalog.transaction() as tx:
             if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
@@ -85,7 +86,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 size=request.size,
                 sha256=request.sha256,
                 parts=count,
-                part_size=part_size(request.size, settings),
+                part_size=each,
                 object_key=key,
                 s3_upload_id=multipart,
                 seconds=seconds,
