@@ -201,6 +201,7 @@ class Upload(TypedDict):
     part_size: NotRequired[int]
     parts: NotRequired[list[PartUrl]]
     received: NotRequired[list[ReceivedPart]]
+    joined: NotRequired[bool]
 
 
 class LabelFile(TypedDict):

@@ -195,7 +195,7 @@ def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
     """Their parts leave the store; a fresh one stays."""
     made = {}
     for name, seconds in (("old", -1), ("new", 3600)):
-        upload_id = tidy.store.create_multipart(f"u/{name}")
+        upload_id = tidy.store.create_multipart(f"u/{name}", 5 << 20)
         with catalog.transaction() as tx:
             row = uploads.add(
                 tx,

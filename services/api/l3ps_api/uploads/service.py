@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -72,7 +71,8 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/archive"  # nothing of the client's: what it calls the file is the row's
     seconds = min(settings.upload_ttl_seconds, MAX_SECONDS)
-    multipart = services.store.create_multipart(key)
+    each = part_size(request.size, settings)
+    multipart = services.store.create_multipart(key, each)
     try:
         with services.catalog.transaction() as tx:
             if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
@@ -86,7 +86,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 size=request.size,
                 sha256=request.sha256,
                 parts=count,
-                part_size=part_size(request.size, settings),
+                part_size=each,
                 object_key=key,
                 s3_upload_id=multipart,
                 seconds=seconds,
@@ -120,15 +120,18 @@ def get(services: Services, upload_id: str) -> UploadProgress:
     with services.catalog.reading() as session:
         row = uploads.get(session, upload_id)
     received: list[ReceivedPart] = []
+    joined = False
     if row.state is UploadState.OPEN:
-        with suppress(UploadError):  # closed in this moment
+        try:
             received = [
                 ReceivedPart(number=part.number, size=part.size, etag=part.etag)
                 for part in services.store.list_parts(row.object_key, row.s3_upload_id)
                 if part.size is not None and part.size == part_length(part.number, row, services.settings)
             ]
+        except UploadError:  # a completion joined the parts and was cut off, or the upload was closed in this moment
+            joined = services.store.exists(row.object_key)
     each = size_of_parts(row, services.settings)
-    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received)
+    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received, joined=joined)
 
 
 def urls(services: Services, upload_id: str, numbers: Iterable[int]) -> PartUrls:
