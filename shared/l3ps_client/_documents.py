@@ -58,6 +58,7 @@ class Drive(_File):
     format: str | None
     state: FileState
     problems: list[ErrorItem]
+    problem_count: NotRequired[int]
     info: dict[str, Any] | None
 
 

@@ -58,7 +58,8 @@ class UploadRow(Owned, Base):
 class DriveRow(Owned, Base):
     """A drive log.
 
-    ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
+    ``problem`` is ``{"problems": [Problem.as_dict()…], "count"}``, the first of very many
+    (l3ps_platform.workflow.problems); a ready drive may carry one too: scans that a job can skip.
     ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
     counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
     archive file's: the client's claim until the ingest stage has compared it. A drive by reference has a ``source``

@@ -20,6 +20,7 @@ from l3ps_platform.workflow.attempts import Cost, note_again, note_end, note_fig
 from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
+from l3ps_platform.workflow.problems import kept_problems
 from l3ps_platform.workflow.retries import Retry, next_try
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
 
@@ -82,7 +83,7 @@ def drive_checked(
     stage = finish(tx, claim, StageState.DONE, cost=cost, error=None if usable else _rejection(problems))
     drive = drives.lock(tx.session, _must(stage.drive_id))
     drive.state = DriveState.READY if usable else DriveState.REJECTED
-    drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    drive.problem = kept_problems(problems)
     drive.sha256, drive.format, drive.info = sha256, format, info
     drive.size = drive.size if size is None else size
     tx.session.flush()
@@ -103,7 +104,7 @@ def model_checked(
     stage = finish(tx, claim, StageState.DONE, cost=cost, error=_rejection(problems) if problems else None)
     model = bundles.lock(tx.session, _must(stage.model_id))
     model.state = ModelState.REJECTED if problems else ModelState.READY
-    model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    model.problem = kept_problems(problems)
     model.sha256, model.info = sha256, info
     tx.session.flush()
     notices.of_upload(tx, model)
@@ -273,7 +274,7 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
         what=f"it could not be checked: {(stage.error or {}).get('message', 'unknown error')}",
         remedy="Upload it again; if that does not help, ask whoever runs the service.",
     )
-    kept = {"problems": [problem.as_dict()]}
+    kept = kept_problems([problem])
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept

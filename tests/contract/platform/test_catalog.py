@@ -266,7 +266,7 @@ class TestModels:
         rejected = play.model(problems=[BROKEN])
         with catalog.reading() as session:
             row = bundles.get(session, rejected)
-        assert (row.state, row.problem) == (ModelState.REJECTED, {"problems": [BROKEN.as_dict()]})
+        assert (row.state, row.problem) == (ModelState.REJECTED, {"problems": [BROKEN.as_dict()], "count": 1})
         with catalog.transaction() as tx:
             again = workflow.accept_model(tx, name=row.name, filename="m.zip", size=1, object_key="k")
         with catalog.reading() as session:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import JobState, StageName, StageState
+from l3ps_platform.catalog import JobState, StageName, StageState, outputs
 from l3ps_worker import keys, runner
 from l3ps_worker import refine as refining
 
@@ -134,3 +134,17 @@ def test_another_machine_s_rounding_leaves_published_labels_alone(segmented, mon
     assert first != second
     assert as_its_manifest_says(bench, again)
     assert as_its_manifest_says(bench, job)
+
+
+def test_the_size_of_labels_is_known_though_their_worker_died_before_noting_it(segmented) -> None:
+    """Retention by size counts what the rows say."""
+    bench, job = segmented
+    primal = bench.stages(job)[0].output_key
+    with bench.catalog.transaction() as tx:
+        outputs.lock(tx.session, primal.rpartition("/")[0]).bytes = 0
+    again = bench.submit(bench.job(job).drive_id, preset="fast")
+    bench.run()
+    assert bench.stages(again)[0].cached
+    with bench.catalog.transaction() as tx:
+        row = outputs.lock(tx.session, primal.rpartition("/")[0])
+        assert row.bytes == bench.store.stat(primal).size > 0
