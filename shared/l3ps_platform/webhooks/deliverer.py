@@ -26,6 +26,7 @@ from l3ps_platform.webhooks.guard import Guard
 from l3ps_platform.webhooks.schedule import wait_before
 from l3ps_platform.webhooks.sending import Answer, attempt
 from l3ps_platform.workflow import deliveries
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.deliveries import Parcel
 
 log = structlog.get_logger(__name__)
@@ -56,6 +57,7 @@ class Deliverer:
         self._guard = Guard(settings.webhook_allow, http=settings.webhook_http)
         self._owner = f"{socket.gethostname()[:32]}:{os.getpid()}:{secrets.token_hex(4)}"
         self._pruned = float("-inf")
+        self.chore = Chore("deliverer", "take", "deliver", "prune")
 
     def run(self, stop: threading.Event) -> None:
         """Deliver until ``stop`` is set; what is in flight then is given back and made again by whoever comes next."""
@@ -67,16 +69,13 @@ class Deliverer:
         loop.set_default_executor(ThreadPoolExecutor(2 * IN_FLIGHT + 2, "webhooks"))
         flights: dict[asyncio.Task[None], Parcel] = {}
         while not stop.is_set():
-            try:
+            with self.chore.step("take"):
                 for parcel in await asyncio.to_thread(self._take, IN_FLIGHT - len(flights)):
                     flights[asyncio.create_task(self._deliver(parcel))] = parcel
-                if loop.time() - self._pruned > PRUNE_SECONDS:
-                    self._pruned = loop.time()
+            if loop.time() - self._pruned > PRUNE_SECONDS:
+                self._pruned = loop.time()
+                with self.chore.step("prune"):
                     await asyncio.to_thread(self._prune)
-            except PlatformError as error:
-                log.warning("deliverer waits", reason=str(error))
-            except Exception:
-                log.exception("deliverer failed")
             landed = await self._wait(flights)
             for task in landed:
                 del flights[task]
@@ -94,14 +93,10 @@ class Deliverer:
         return done - {pause}
 
     async def _deliver(self, parcel: Parcel) -> None:
-        try:
-            seconds = self._settings.webhook_timeout_seconds
-            answer = await attempt(self._guard, parcel.url, parcel.secrets, parcel.id, parcel.body, seconds)
+        seconds = self._settings.webhook_timeout_seconds
+        answer = await attempt(self._guard, parcel.url, parcel.secrets, parcel.id, parcel.body, seconds)
+        with self.chore.step("deliver"):  # what is not recorded is made again when its lease is over
             await asyncio.to_thread(self._record, parcel, answer)
-        except PlatformError as error:
-            log.warning("delivery not recorded, it will be made again", delivery=parcel.id, reason=str(error))
-        except Exception:
-            log.exception("delivery failed in an unforeseen way", delivery=parcel.id)
 
     def _take(self, limit: int) -> list[Parcel]:
         if limit <= 0:

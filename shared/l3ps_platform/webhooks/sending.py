@@ -18,11 +18,14 @@ from importlib.metadata import version
 
 import certifi
 import httpx
+import structlog
 
 from l3ps_platform.errors import TargetRefused
 from l3ps_platform.webhooks import signing
 from l3ps_platform.webhooks.guard import Guard, Target, host_of
 from l3ps_platform.webhooks.schedule import read_retry_after
+
+log = structlog.get_logger(__name__)
 
 MAX_ANSWER = 4096
 MAX_TRIED = 3
@@ -66,15 +69,18 @@ async def attempt(guard: Guard, url: str, secrets: Sequence[str], id: str, body:
         id: of the message.
         body: JSON.
         seconds: for everything together, from resolving the name to the end of the answer.
+
+    Returns:
+        How it ended, whatever went wrong: what is not counted as an attempt would be made again for ever.
     """
     start = time.monotonic()
-    headers = {
-        "content-type": "application/json",
-        "accept-encoding": "identity",
-        "user-agent": f"l3ps-webhooks/{version('l3ps-platform')}",
-        **signing.headers(secrets, id, int(time.time()), body),
-    }
     try:
+        headers = {
+            "content-type": "application/json",
+            "accept-encoding": "identity",
+            "user-agent": f"l3ps-webhooks/{version('l3ps-platform')}",
+            **signing.headers(secrets, id, int(time.time()), body),
+        }
         async with asyncio.timeout(seconds):
             target = await asyncio.to_thread(guard.admit, url)
             answer = await _post(target, headers, body, seconds)
@@ -84,6 +90,9 @@ async def attempt(guard: Guard, url: str, secrets: Sequence[str], id: str, body:
         answer = Answer(error=f"no complete answer within {seconds:g} s")
     except (httpx.HTTPError, ssl.SSLError, OSError) as error:
         answer = Answer(error=f"{type(error).__name__}: {error}"[:200])
+    except Exception as error:
+        log.exception("delivery failed in an unforeseen way", delivery=id)
+        answer = Answer(error=f"not sent: the service failed ({type(error).__name__})")
     return Answer(answer.status, answer.error, answer.retry_after, time.monotonic() - start)
 
 

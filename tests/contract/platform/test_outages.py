@@ -103,7 +103,7 @@ def test_leases_that_ran_out_unseen_are_borne_for_a_while(play, sent, tidy) -> N
     play.run(lambda tx, claim: workflow.fail(tx, claim, CRASHED, retry=Retry(3, 0.0)))
     settings = tidy.settings.model_copy(update={"reconcile_seconds": 0.01, "lease_seconds": 3600.0})
     stop = threading.Event()
-    broom = threading.Thread(target=Reconciler(play.catalog, tidy.queue, tidy.store, settings).run, args=(stop,))
+    broom = threading.Thread(target=Reconciler(play.catalog, tidy.queue, settings).run, args=(stop,))
     broom.start()
     while play.stage(message.stage_id).state is not StageState.QUEUED:  # a round was made
         pass

@@ -46,8 +46,8 @@ def test_a_stage_far_beyond_its_time_limit_is_not_held_by_its_lease(tidy, play, 
     """Its worker ought to have ended it at the limit and goes on to prolong its lease."""
     play.submit(scenes=1)
     claim = play.take(lease=3600.0)
-    assert tidy(stage_seconds=3600.0, lease_seconds=0.0, train_seconds=0.001).expired == 0
-    assert tidy(stage_seconds=0.0, lease_seconds=0.0).expired == 1
+    assert tidy(stage_seconds=3600.0, lease_seconds=0.0, train_seconds=0.001).hanging == 0
+    assert tidy(stage_seconds=0.0, lease_seconds=0.0).hanging == 1
     stage = play.stage(claim.stage_id)
     assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "timeout")
     assert "its worker did not stop it" in stage.error["message"]
@@ -126,13 +126,13 @@ def test_queues_are_read_when_something_is_overdue_and_no_more_often_than_messag
     reads = []
     pending = tidy.queue.pending
     monkeypatch.setattr(tidy.queue, "pending", lambda name: reads.append(name) or pending(name))
-    reconciler = Reconciler(catalog, tidy.queue, tidy.store, tidy.settings)
+    reconciler = Reconciler(catalog, tidy.queue, tidy.settings)
     play.submit(scenes=1)
     assert (reconciler.run_once().resent, reads) == (0, [])
     with catalog.transaction() as tx:
         for stage in tx.session.scalars(select(StageRow).where(StageRow.state == StageState.QUEUED)):
             stage.queued_at = tx.now - timedelta(minutes=1)
-    late = Reconciler(catalog, tidy.queue, tidy.store, tidy.settings)
+    late = Reconciler(catalog, tidy.queue, tidy.settings)
     assert (late.run_once().resent, late.run_once().resent, reads) == (1, 0, ["segment"])
 
 
@@ -143,6 +143,7 @@ def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     for _ in range(3):
         play.take(lease=-1)
         tidy(retry_seconds=0)
+    tidy.sweep()
     with play.catalog.reading() as session:
         row = drives.get(session, drive.id)
     assert row.state is DriveState.REJECTED
@@ -161,7 +162,7 @@ def test_a_drive_deleted_while_its_archive_is_swept_stays_deleted(tidy, play, mo
         delete(key)
 
     monkeypatch.setattr(tidy.store, "delete", meanwhile)
-    assert tidy().archives == 1
+    assert tidy.sweep()["archives"] == 1
     with catalog.reading() as session:
         swept = drives.many(session, [rejected])[rejected]
     assert swept.deleted_at is not None and swept.object_key is None
@@ -175,9 +176,9 @@ def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -
             drives.lock(tx.session, drive).object_key = key
     with play.catalog.transaction() as tx:
         drives.delete(tx, deleted)
-    assert tidy().archives == 2
+    assert tidy.sweep()["archives"] == 2
     assert [info.key for info in tidy.store.list()] == ["a/3"]
-    assert tidy().archives == 0
+    assert tidy.sweep()["archives"] == 0
 
 
 def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
@@ -197,7 +198,7 @@ def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
                 seconds=seconds,
             )
         made[name] = (row.id, upload_id)
-    assert tidy().uploads == 1
+    assert tidy.sweep()["uploads"] == 1
     with catalog.reading() as session:
         assert uploads.get(session, made["old"][0]).state is UploadState.ABORTED
         assert uploads.get(session, made["new"][0]).state is UploadState.OPEN
@@ -253,7 +254,7 @@ def test_a_dead_redis_is_said_so_and_the_row_stays_queued(catalog: Catalog, play
 def test_the_loop_stops_when_told(tidy, catalog: Catalog) -> None:
     stop = threading.Event()
     stop.set()
-    Reconciler(catalog, tidy.queue, tidy.store, tidy.settings).run(stop)
+    Reconciler(catalog, tidy.queue, tidy.settings).run(stop)
 
 
 def test_a_message_that_a_killed_worker_held_is_forgotten_when_its_stage_is_over(tidy, play, sent, redis_url) -> None:

@@ -194,7 +194,7 @@ class TestAnnotations:
         play.run(done)
         with play.catalog.transaction() as tx:
             annotation_sets.delete(tx, images)
-        assert tidy().archives == 1
+        assert tidy.sweep()["archives"] == 1
         assert not tidy.store.exists("uploads/u/a.zip")
         with play.catalog.reading() as session:
             assert [row.id for row in annotation_sets.page(session)] == [other]

@@ -218,7 +218,7 @@ def served(tmp_path: Path, redis_url: str) -> Iterator[Callable]:
         context = Context(settings)
         context.store.ensure()
         stop = threading.Event()
-        reconciler = workflow.Reconciler(context.catalog, context.queue, context.store, settings)
+        reconciler = workflow.Reconciler(context.catalog, context.queue, settings)
         thread = threading.Thread(target=reconciler.run, args=(stop,))
         thread.start()
         try:
