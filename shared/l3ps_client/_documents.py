@@ -223,6 +223,7 @@ class LabelFiles(TypedDict):
     job_id: str
     format: str
     files: list[LabelFile]
+    next: NotRequired[str | None]
 
 
 class Me(TypedDict):

@@ -33,6 +33,7 @@ from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.patience import HangUp
+from l3ps_api.places import Places
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
@@ -55,6 +56,10 @@ from l3ps_platform.webhooks import Deliverer
 from l3ps_platform.workflow import Reconciler, Sweeper
 
 log = structlog.get_logger(__name__)
+
+ARCHIVES = 16
+"""Archives sent at once: each holds a connection to the store, a manifest (45 MB for 68,000 files) and, while it waits
+for a block, one of the forty threads that answer requests."""
 
 DESCRIPTION = """
 Drive logs in, panoptic labels on every LiDAR point out.
@@ -85,6 +90,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.services = services
     app.state.keyring = Keyring(settings, catalog)
     app.state.events = EventHub(catalog, settings.event_streams)
+    app.state.archives = Places(ARCHIVES, "too-many-archives", "archives", "Wait until one has been downloaded.")
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))

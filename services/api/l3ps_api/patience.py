@@ -40,6 +40,7 @@ class PatientResponse(StreamingResponse):
             log.info("hung up on a client that takes nothing")
             if self._hang_up is not None:
                 self._hang_up()
+                await asyncio.sleep(0)  # lets the server see it, which else calls it an error that we end early
 
 
 class HangUp:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import BinaryIO, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -110,9 +111,12 @@ def parse_sources(text: str) -> tuple[Source, ...]:
     return tuple(sources)
 
 
+_parsed = lru_cache(maxsize=1)(parse_sources)
+
+
 def find_source(settings: Settings, reference: Reference, project_id: str) -> Source | None:
     """The narrowest source through which a project may read a place; None where there is none."""
-    sources = parse_sources(settings.sources.get_secret_value())
+    sources = _parsed(settings.sources.get_secret_value())
     fitting = [source for source in sources if source.covers(reference, project_id)]
     return max(fitting, key=lambda source: len(source.path), default=None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 
 from sqlalchemy.orm import Session
@@ -19,10 +20,26 @@ _AGAIN = (JobState.FAILED, JobState.CANCELLED)
 
 
 def outputs_to_keep(session: Session, job_id: str) -> list[str]:
-    """Keys of the outputs that another run of a job goes on from."""
-    scenes = [stage.scene_id for stage in stages.of_job(session, job_id) if stage.scene_id is not None]
-    last = [_last_done(stages.of_scene(session, scene)) for scene in dict.fromkeys(scenes)]
-    return [stage.output_key for stage in last if stage is not None and stage.output_key is not None]
+    """Keys of the outputs that another run of a job goes on from, and that may be gone. NotFound.
+
+    Only of what was read and then failed: its reader may have failed for want of it. Others are taken to be there; a
+    stage that does not find its input fails, and the next retry looks.
+    """
+    if jobs.get(session, job_id).state not in _AGAIN:
+        return []
+    planned = stages.of_job(session, job_id)
+    of_scenes: defaultdict[str, list[StageRow]] = defaultdict(list)
+    for stage in planned:
+        if stage.scene_id is not None:
+            of_scenes[stage.scene_id].append(stage)
+    publication = [stage for stage in planned if stage.scene_id is None]
+    keys = []
+    for own in of_scenes.values():
+        last = _last_done(own)
+        readers = [] if last is None else [*own[own.index(last) + 1 :], *publication]
+        if last is not None and last.output_key is not None and readers[0].state is StageState.FAILED:
+            keys.append(last.output_key)
+    return keys
 
 
 def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRow:

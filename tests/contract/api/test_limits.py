@@ -84,9 +84,14 @@ def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
         parts = {"parts": [{"number": 1, "etag": etag}]}
         annotations = http.post(f"/v1/uploads/{upload['id']}/complete", json=parts).json()["id"]
         request = {"annotations": annotations, "backbone": "scratch"}
-        assert http.post("/v1/models/train", json=request | {"name": "first"}).status_code == 202
+        first = http.post("/v1/models/train", json=request | {"name": "first"})
+        assert first.status_code == 202
         second = http.post("/v1/models/train", json=request | {"name": "second"})
         assert refused(second, "quota-reached")["errors"][0]["where"] == "jobs"
+        path = f"/v1/trainings/{first.json()['id']}"
+        assert http.post(f"{path}/cancel").json()["state"] == "cancelled"
+        assert http.post("/v1/models/train", json=request | {"name": "second"}).status_code == 202
+        refused(http.post(f"{path}/retry"), "quota-reached")
 
 
 def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_once(fresh, strict):
