@@ -88,6 +88,7 @@ class Settings(BaseSettings):
     # How long a process believes what it has read about a key. In the process that revokes one it ends at once.
     key_cache_seconds: float = Field(default=2.0, ge=0)
     max_open_uploads: int = Field(default=1000, ge=1)  # of a project
+    max_open_upload_bytes: int = Field(default=1024 * GiB, ge=1)  # of a project: sixteen of the largest at once
     max_active_jobs: int = Field(default=1000, ge=1)  # of a project, trainings too
 
     idempotency_seconds: float = Field(default=24 * 3600.0, gt=0)  # life of an Idempotency-Key

@@ -21,11 +21,10 @@ BURST = 16
 def strict(api_process, redis_server) -> str:
     """An API that lets each key ask so often, and again after minutes."""
     limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
-    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1", "event_streams": "4"}
+    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_open_upload_bytes": "1000", "max_active_jobs": "1"}
     redis_url = redis_server.removesuffix("/0") + "/4"
-    return api_process(
-        token=TOKEN, redis_url=redis_url, training="1", trusted_proxies="127.0.0.1", **limits, **quotas
-    )  # fmt: skip
+    others = {"event_streams": "4", "trusted_proxies": "127.0.0.1", "training": "1"}
+    return api_process(token=TOKEN, redis_url=redis_url, **limits, **quotas, **others)
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +73,16 @@ def test_a_project_has_so_many_open_uploads_and_may_go_on_when_one_is_closed(fre
         assert http.delete(uploads[0].headers["location"]).status_code == 204
         again = http.post("/v1/uploads", json=UPLOAD, headers=key)
     assert again.status_code == 201, "a refusal for now is not kept with the key"
+
+
+def test_a_project_has_so_many_bytes_in_open_uploads(fresh):
+    """The disk is everybody's: what is announced counts, from the announcement to the completion."""
+    with fresh() as http:
+        first = http.post("/v1/uploads", json=UPLOAD | {"size": 900})
+        document = refused(http.post("/v1/uploads", json=UPLOAD | {"size": 101}), "quota-reached")
+        assert document["errors"][0]["where"] == "size" and "900 bytes" in document["errors"][0]["what"]
+        assert http.delete(first.headers["location"]).status_code == 204
+        assert http.post("/v1/uploads", json=UPLOAD | {"size": 101}).status_code == 201
 
 
 def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):

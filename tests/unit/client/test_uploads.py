@@ -1,15 +1,18 @@
 """Files on their way up: in parts, checked, gone on with after a death, and nothing left of what was refused."""
 
+import fcntl
 import hashlib
 import os
 import signal
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack
 
 import pytest
 
 from l3ps_client import Client, Conflict, Damaged, InvalidRequest, NotFound, Refused, Retry, Unreachable
+from l3ps_client._ledger import Ledger
 
 AT_ONCE = Retry(first=0.0)
 PARTS = 6
@@ -351,6 +354,26 @@ def test_two_processes_with_the_same_file_do_not_share_an_upload(service, client
     go.set()
     first.join(30)
     assert service.whole("upl_1") == service.whole("upl_2") == file.read_bytes()
+
+
+def test_a_note_that_another_process_deletes_in_this_moment_is_made_anew(tmp_path, monkeypatch):
+    """The other one ends between our opening and our locking the file: what we lock must be the file that is there."""
+    ledger, flock = Ledger(tmp_path), fcntl.flock
+    with ExitStack() as other:
+        other.enter_context(ledger.note(file="morning.tar"))
+
+        def late(file, how):
+            monkeypatch.undo()
+            other.close()
+            flock(file, how)
+
+        monkeypatch.setattr(fcntl, "flock", late)
+        with ledger.note(file="morning.tar") as note:
+            assert note.lasting
+            note.save(path=str(tmp_path / "morning.tar"), upload_id="upl_1")
+            with ledger.note(file="morning.tar") as third:
+                assert not third.lasting
+        assert ledger.of_file(tmp_path / "morning.tar") == [note.facts]
 
 
 def test_a_killed_process_leaves_a_note_and_the_next_one_goes_on(service, client, file, tmp_path):
