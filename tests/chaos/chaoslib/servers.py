@@ -101,8 +101,13 @@ class Redis(Server):
     def left(self) -> dict[str, int]:
         """Messages in its queues, and those that were delivered and not acknowledged."""
         with redis.Redis(port=self.port) as client:
-            found = {name: client.llen(name) for name in ("segment", "refine", "train")}
-            return {name: count for name, count in (found | {"unacked": client.hlen("unacked")}).items() if count}
+            return left(client)
+
+
+def left(client: redis.Redis) -> dict[str, int]:
+    """Messages in the queues, and those that were delivered and not acknowledged."""
+    found = {name: client.llen(name) for name in ("segment", "refine", "train")}
+    return {name: count for name, count in (found | {"unacked": client.hlen("unacked")}).items() if count}
 
 
 class Minio(Server):
