@@ -49,6 +49,17 @@ def test_a_stage_that_kills_every_worker_fails_with_a_reason(tidy, play, sent) -
     assert "stopped answering" in row.error["message"]
 
 
+def test_a_stage_far_beyond_its_time_limit_is_not_held_by_its_lease(tidy, play, sent) -> None:
+    """Its worker ought to have ended it at the limit and goes on to prolong its lease."""
+    play.submit(scenes=1)
+    claim = play.take(lease=3600.0)
+    assert tidy(stage_seconds=3600.0, lease_seconds=0.0, train_seconds=0.001).expired == 0
+    assert tidy(stage_seconds=0.0, lease_seconds=0.0).expired == 1
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "timeout")
+    assert "its worker did not stop it" in stage.error["message"]
+
+
 def test_a_live_lease_is_left_alone(tidy, play, sent) -> None:
     play.submit(scenes=1)
     claim = play.take(lease=60)
