@@ -4,7 +4,7 @@ import threading
 
 from l3ps.errors import Problem
 from l3ps_platform import workflow
-from l3ps_platform.catalog import JobState, StageMessage, StageState
+from l3ps_platform.catalog import JobState, StageState
 from l3ps_platform.workflow import Cause, Reconciler, Retry, failure
 
 AWAY = failure("the store is away", Cause.STORE_UNAVAILABLE)
@@ -57,16 +57,6 @@ def test_the_wait_in_an_outage_has_a_bound(play, sent) -> None:
     stage = fail(play, AWAY, Retry(3, seconds=3600.0, longest_seconds=60.0))
     row = play.stage(stage)
     assert (row.not_before - row.outage_since).total_seconds() == 60
-
-
-def test_a_lease_that_is_taken_over_counts_as_a_failure(play, sent) -> None:
-    play.submit(scenes=1)
-    message = sent[0]
-    for attempt, taken in ((1, 1), (1, 2), (2, 3)):
-        claim = play.take(StageMessage(message.stage_id, attempt, message.name, message.queue), lease=-1)
-        assert claim.attempt == taken
-    assert play.stage(message.stage_id).failures == 2
-    assert play.stage(message.stage_id).error["cause"] == "lease-lost"
 
 
 def test_leases_that_ran_out_unseen_are_borne_for_a_while(play, sent, tidy) -> None:

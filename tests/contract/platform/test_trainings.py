@@ -130,11 +130,11 @@ def test_a_dead_worker_s_training_goes_on(play, sent, start, see, tidy) -> None:
     assert see(id).state is JobState.SUCCEEDED
 
 
-def test_notes_are_the_owner_s_alone(play, sent, start, see) -> None:
+def test_notes_are_the_owner_s_alone(play, sent, start, see, tidy) -> None:
     id = start()
-    message = sent[0]
-    dead = play.take(message, owner="dead", lease=-1)
-    claim = play.take(message, owner="alive")
+    dead = play.take(owner="dead", lease=-1)
+    tidy(retry_seconds=0)
+    claim = play.take(owner="alive")
     with play.catalog.transaction() as tx:
         workflow.note_training(tx, claim, figures={"loss": 0.5}, log_key="l")
         workflow.note_training(tx, claim, figures={"loss": 0.4})
