@@ -123,7 +123,7 @@ class Settings(BaseSettings):
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
     # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
-    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    # after as long as it has waited already, at most after this, and fails when it has waited this long in all.
     outage_retry_seconds: float = 60.0
     outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0

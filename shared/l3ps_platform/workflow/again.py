@@ -118,8 +118,9 @@ def _reset(tx: Transaction, stage: StageRow) -> None:
     """A stage as when it was planned, but for the number of its attempt."""
     stage.state = StageState.WAITING
     stage.attempt += 1
-    stage.failures = 0
-    stage.outage_since = stage.not_before = stage.finished_at = stage.started_at = None
+    stage.failures = stage.losses = 0
+    stage.outage_seconds = 0.0
+    stage.not_before = stage.finished_at = stage.started_at = None
     stage.error = stage.output_key = stage.progress_step = None
     stage.progress_done = stage.progress_total = 0
     stage.fraction = 0.0
