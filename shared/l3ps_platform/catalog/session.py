@@ -28,6 +28,9 @@ from l3ps_platform.errors import CatalogUnavailable
 
 log = structlog.get_logger(__name__)
 
+# What is too large for PostgreSQL (class 54) stays so for ever, though the driver calls it operational like an outage.
+_TOO_MUCH = "54"
+
 # SQLite allows one writer at a time; ours hold the lock for milliseconds, so half a minute is never a real wait.
 SQLITE_BUSY_MS = 30_000
 
@@ -126,6 +129,8 @@ class Catalog:
             with self.engine.connect() as connection:
                 yield connection.execution_options(isolation_level="AUTOCOMMIT")
         except (OperationalError, InterfaceError) as error:
+            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
+                raise
             raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
         except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
             raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
@@ -167,6 +172,8 @@ class Catalog:
                 session.connection(execution_options={"l3ps_write": write})
                 yield session
         except (OperationalError, InterfaceError) as error:
+            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
+                raise
             raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
         except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
             raise CatalogUnavailable("the catalog does not answer: no connection became free") from error

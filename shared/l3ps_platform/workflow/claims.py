@@ -3,7 +3,7 @@
 The queue may deliver a message twice, late or never; none of that matters here. Every change of a stage names the
 attempt and the owner it believes in and does nothing when the row disagrees.
 
-Rows are locked in one order everywhere: drive, model, job or training, stage.
+Rows are locked in one order everywhere: annotations, drive, model, job or training, stage.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Every error of the API is a problem document that names the field and the remedy."""
 
 import socket
+from collections.abc import Iterator
 
 import httpx
 import pytest

@@ -9,7 +9,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import text
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, OperationalError
 
 from l3ps.errors import DriveLogError, ModelError, Problem
 from l3ps_platform import workflow
@@ -155,6 +155,14 @@ def test_a_database_that_is_away() -> None:
     away = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none")
     with pytest.raises(CatalogUnavailable, match="does not answer"):
         away.ping()
+
+
+def test_what_is_too_large_for_the_database_is_no_outage(postgres_url: str) -> None:
+    """It would be waited for in vain."""
+    catalog = Catalog(Settings(database_url=postgres_url).catalog_url)
+    with pytest.raises(OperationalError, match="too deep"), catalog.reading() as session:
+        session.execute(text("DO $$ BEGIN RAISE EXCEPTION 'too deep' USING ERRCODE = '54001'; END $$"))
+    catalog.dispose()
 
 
 def test_a_silent_server_is_given_up_in_seconds(postgres_url: str) -> None:

@@ -140,9 +140,10 @@ def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     with play.catalog.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
     tidy.store.put_bytes("uploads/u/d.zip", b"archive")
+    crashed = workflow.failure("it was killed", workflow.Cause.CRASHED)
     for _ in range(3):
-        play.take(lease=-1)
-        tidy(retry_seconds=0)
+        play.run(lambda tx, claim: workflow.fail(tx, claim, crashed, retry=Retry(3, 0)))
+        tidy()
     tidy.sweep()
     with play.catalog.reading() as session:
         row = drives.get(session, drive.id)

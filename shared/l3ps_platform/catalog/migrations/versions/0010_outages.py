@@ -9,7 +9,7 @@ down_revision = "0009"
 
 def upgrade() -> None:
     op.add_column("stages", sa.Column("losses", sa.BigInteger(), nullable=False, server_default="0"))
-    op.add_column("stages", sa.Column("outage_seconds", sa.Float(), nullable=False, server_default="0"))
+    op.add_column("stages", sa.Column("outage_seconds", sa.Double(), nullable=False, server_default="0"))
     op.drop_column("stages", "outage_since")
 
 
