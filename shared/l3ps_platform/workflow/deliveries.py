@@ -162,7 +162,8 @@ def disable(tx: Transaction, hook: WebhookRow, reason: str) -> None:
     )
     _give_up(tx.session.scalars(waiting), hook)
     tx.session.flush()
-    tx.emit(EventKind.WEBHOOK_DISABLED, hook, {"id": hook.id, "url": hook.url, "reason": reason})
+    # Without the URL, which often holds a secret: whoever may read, and every other webhook's receiver, is told this.
+    tx.emit(EventKind.WEBHOOK_DISABLED, hook, {"id": hook.id, "reason": reason})
 
 
 def _give_up(rows: Iterable[DeliveryRow], hook: WebhookRow) -> None:

@@ -197,7 +197,8 @@ def test_410_switches_a_webhook_off_and_says_so(post) -> None:
     post.end(first, GONE)
     assert not post.get(hook).enabled and "410" in post.get(hook).disabled_reason
     (told,) = post.rows(watcher)
-    assert json.loads(told.body)["data"]["id"] == hook
+    data = json.loads(told.body)["data"]
+    assert data == {"id": hook, "reason": post.get(hook).disabled_reason}, "a URL may be a secret"
     with pytest.raises(Conflict, match="switched off"):
         post.ping(hook)
     post.end(second, REFUSED)  # was under way: it is not tried again
