@@ -31,8 +31,10 @@ from l3ps_platform.workflow.deliveries import Parcel
 
 log = structlog.get_logger(__name__)
 
-IN_FLIGHT = 8
-"""Attempts at once in this process: a receiver that hangs takes half of them at most."""
+IN_FLIGHT = 16
+"""Attempts at once in this process."""
+SHARE = IN_FLIGHT // 2
+"""Of them, those of one project: however many of its receivers hang, others find room."""
 
 LOOK_SECONDS = 0.5
 """How often the catalog is asked what is due."""
@@ -102,16 +104,18 @@ class Deliverer:
         if limit <= 0:
             return []
         with self._catalog.reading() as session:
-            if not webhooks.with_due(session, self._catalog.now(session), limit=1):
+            if not webhooks.any_waiting(session, self._catalog.now(session)):
                 return []
         lease = self._settings.webhook_timeout_seconds + RECORD_SECONDS
         with self._catalog.transaction() as tx:
-            return deliveries.take(tx, self._owner, limit=limit, lease_seconds=lease)
+            return deliveries.take(tx, self._owner, limit=limit, share=SHARE, lease_seconds=lease)
 
     def _record(self, parcel: Parcel, answer: Answer) -> None:
         settings = self._settings
         wait = wait_before(settings.webhook_retry_seconds, parcel.attempts + 1, answer.retry_after)
-        outcome = deliveries.Attempt(answer.status, answer.error, answer.seconds, again_after=wait, gone=answer.gone)
+        outcome = deliveries.Attempt(
+            answer.status, answer.error, answer.seconds, wait, gone=answer.gone, timed_out=answer.timed_out
+        )
         disable_after = timedelta(days=settings.webhook_disable_days)
         with suppress(NotFound), self._catalog.transaction() as tx:  # its webhook was deleted meanwhile
             deliveries.attempted(tx, parcel, outcome, disable_after=disable_after)

@@ -11,7 +11,7 @@ import asyncio
 import ssl
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from importlib.metadata import version
@@ -41,12 +41,14 @@ class Answer:
         error: what went wrong, one sentence; None when the receiver took the message.
         retry_after: how long the receiver asks to be left alone.
         seconds: what it took.
+        timed_out: it was given up at the end of its time.
     """
 
     status: int | None = None
     error: str | None = None
     retry_after: timedelta | None = None
     seconds: float = 0.0
+    timed_out: bool = False
 
     @property
     def delivered(self) -> bool:
@@ -86,14 +88,14 @@ async def attempt(guard: Guard, url: str, secrets: Sequence[str], id: str, body:
             answer = await _post(target, headers, body, seconds)
     except TargetRefused as refusal:
         answer = Answer(error=f"not sent: {refusal.what}")
-    except TimeoutError:
-        answer = Answer(error=f"no complete answer within {seconds:g} s")
+    except (TimeoutError, httpx.TimeoutException):
+        answer = Answer(error=f"no complete answer within {seconds:g} s", timed_out=True)
     except (httpx.HTTPError, ssl.SSLError, OSError) as error:
         answer = Answer(error=f"{type(error).__name__}: {error}"[:200])
     except Exception as error:
         log.exception("delivery failed in an unforeseen way", delivery=id)
         answer = Answer(error=f"not sent: the service failed ({type(error).__name__})")
-    return Answer(answer.status, answer.error, answer.retry_after, time.monotonic() - start)
+    return replace(answer, seconds=time.monotonic() - start)
 
 
 async def _post(target: Target, headers: Mapping[str, str], body: bytes, seconds: float) -> Answer:

@@ -2,12 +2,15 @@
 
 import base64
 import json
+import socket
 from dataclasses import replace
 
+import pytest
 import redis
 
 from l3ps_platform import queue as queue_module
 from l3ps_platform.catalog import QueueName, StageMessage, StageName
+from l3ps_platform.errors import QueueUnavailable
 from l3ps_platform.queue import Queue, make_app
 from l3ps_platform.settings import Settings
 
@@ -54,6 +57,21 @@ def test_pending_passes_over_none_of_a_long_queue_that_grows_meanwhile(redis_url
 
     monkeypatch.setattr(queue._redis, "lrange", meanwhile)
     assert {(message.stage_id, 1) for message in there} <= queue.pending(QueueName.REFINE)
+
+
+def test_a_redis_that_takes_connections_and_never_answers_is_not_waited_for(monkeypatch) -> None:
+    """As one that is stopped, or behind a network that drops what it carries."""
+    monkeypatch.setattr(queue_module, "SENDER_WAITS", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        queue = Queue(Settings(redis_url=f"redis://127.0.0.1:{server.getsockname()[1]}/0"))
+        with pytest.raises(QueueUnavailable, match="does not answer"):
+            queue.send([MESSAGE] * 100)
+
+
+def test_workers_wait_longer_for_an_answer_than_redis_waits_for_a_message() -> None:
+    app = make_app(Settings())
+    with app.connection_for_read() as connection:
+        assert app.conf.broker_transport_options["socket_timeout"] > 2 * connection.transport.brpop_timeout
 
 
 def test_the_visibility_timeout_is_the_same_in_all_three_places() -> None:
