@@ -179,6 +179,8 @@ class Settings(BaseSettings):
     webhook_timeout_seconds: float = Field(default=15.0, gt=0)  # for an attempt as a whole; the specification: 15 to 30
     webhook_disable_days: float = Field(default=5.0, gt=0)  # a webhook that took nothing for so long is switched off
 
+    # What Prometheus has to send as a bearer token. The metrics name projects and models; None: anybody may read them.
+    metrics_token: SecretStr | None = None
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     log_format: Literal["json", "console"] = "json"
@@ -187,6 +189,13 @@ class Settings(BaseSettings):
     @classmethod
     def _listed(cls, value: object) -> object:
         return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+    @field_validator("metrics_token")
+    @classmethod
+    def _none_if_empty(cls, value: SecretStr | None) -> SecretStr | None:
+        return (
+            value if value is not None and value.get_secret_value() else None
+        )  # compose hands on what is not set as ""
 
     @field_validator("trusted_proxies")
     @classmethod

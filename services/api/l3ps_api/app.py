@@ -10,7 +10,7 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry, Gauge, ProcessCollector
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 
 from l3ps_api import errors
 from l3ps_api.access_log import AccessLog
@@ -38,7 +38,9 @@ from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
+from l3ps_api.system.checks import check_all
 from l3ps_api.system.routes import router as system
+from l3ps_api.system.shared import Shared
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
@@ -101,6 +103,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.registry.register(ChoreCollector([one.chore for one in app.state.chores]))
     streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
     streams.set_function(lambda: app.state.events.places.taken)
+    app.state.metrics = Shared(lambda: generate_latest(app.state.registry))
+    app.state.readiness = Shared(lambda: check_all(services))
     guarded = [Depends(authenticate)]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act

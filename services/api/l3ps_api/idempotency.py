@@ -12,13 +12,13 @@ from dataclasses import replace
 import structlog
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from l3ps_api.keyring import SECRET, Principal
 from l3ps_api.limits import over_quota
 from l3ps_api.operations import Operations
 from l3ps_api.problems import ApiProblem, fault
-from l3ps_api.replies import Reply, ask, hold
+from l3ps_api.replies import Reply, again, ask, hold, read_body
 from l3ps_api.services import Services
 from l3ps_platform.catalog import requests
 from l3ps_platform.errors import CatalogUnavailable
@@ -63,7 +63,7 @@ class Idempotency:
             await self.app(scope, receive, send)
             return
         key = _usable(given)
-        body = await _read(receive)
+        body = await read_body(receive)
         if body is None:
             return  # the client has gone in the middle of its request
         services = replace(self._services, catalog=self._services.catalog.scoped(principal.project_id))
@@ -102,10 +102,10 @@ class Idempotency:
         headers = [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.headers.items()]
         body = kept.body
         if body is None and kept.made is not None:
-            again = await self._remake(scope, services, kept.made)
-            if again.status != 200:
-                return again
-            body = again.body
+            remade = await self._remake(scope, services, kept.made)
+            if remade.status != 200:
+                return remade
+            body = remade.body
         return Reply(kept.status, [*headers, (b"idempotent-replay", b"true")], body or b"")
 
     async def _done(
@@ -129,7 +129,7 @@ class Idempotency:
             }
             only = tables.get(scope["path"].removeprefix("/v1/"))
             with requests.bound(replace(held, kinds=frozenset(tables.values()), only=only)):
-                reply = await hold(self.app, scope, _again(body, receive), send) or Reply()
+                reply = await hold(self.app, scope, again(body, receive), send) or Reply()
         await run_in_threadpool(self._record, services, held, reply)
         return reply
 
@@ -145,9 +145,9 @@ class Idempotency:
                 }  # fmt: skip
                 body = _QUOTED_SECRET.sub(b"null", reply.body)  # shown once, and never kept
                 private = "no-store" in (reply.header(b"cache-control") or "")
-                again = frozenset(self._remade) - _SHOWN_ONCE
+                tables = frozenset(self._remade) - _SHOWN_ONCE
                 requests.finish(
-                    tx, held, reply.status, headers, body, limit=KEEP_BYTES, private=private, again=again
+                    tx, held, reply.status, headers, body, limit=KEEP_BYTES, private=private, again=tables
                 )  # fmt: skip
         except CatalogUnavailable as error:
             log.warning("an answer could not be kept; its lease runs out", reason=str(error))
@@ -180,29 +180,6 @@ def fingerprint(principal: Principal, scope: Scope, body: bytes) -> str:
     found.update(scope.get("raw_path", scope["path"].encode()) + b"?" + scope["query_string"] + b"\n")
     found.update(body)
     return found.hexdigest()
-
-
-async def _read(receive: Receive) -> bytes | None:
-    blocks = []
-    while (message := await receive())["type"] == "http.request":
-        blocks.append(message.get("body", b""))
-        if not message.get("more_body"):
-            return b"".join(blocks)
-    return None
-
-
-def _again(body: bytes, receive: Receive) -> Receive:
-    """A stream of messages that begins with the body once more."""
-    given = False
-
-    async def replayed() -> Message:
-        nonlocal given
-        if given:
-            return await receive()
-        given = True
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    return replayed
 
 
 def _refused(

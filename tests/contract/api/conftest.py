@@ -14,9 +14,11 @@ import httpx
 import numpy as np
 import psycopg
 import pytest
+from fastapi.testclient import TestClient
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
+from l3ps_api.app import create_app
 from l3ps_cli.main import app
 from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.processes import Processes
@@ -203,6 +205,16 @@ def _looked_into(settings: Settings) -> Iterator[Service]:
     with httpx.Client(base_url=settings.api_url, headers=credentials, timeout=30) as http:
         yield Service(http, catalog, open_store(settings), settings)
     catalog.dispose()
+
+
+@pytest.fixture
+def replica(service) -> Iterator[TestClient]:
+    """Another API process' app on the same catalog, which believes for long what it has read about a key."""
+    api = create_app(service.settings.model_copy(update={"key_cache_seconds": 3600.0}))
+    credentials = {"Authorization": f"Bearer {service.token}"}
+    yield TestClient(api, base_url="http://127.0.0.1", headers=credentials)
+    api.state.services.catalog.dispose()
+    api.state.services.queue.close()
 
 
 @pytest.fixture(scope="session")

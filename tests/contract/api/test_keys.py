@@ -5,9 +5,7 @@ from datetime import UTC, datetime, timedelta
 
 import httpx
 import pytest
-from fastapi.testclient import TestClient
 
-from l3ps_api.app import create_app
 from l3ps_api.keyring import Keyring, digest, new_secret
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, keys
 from l3ps_platform.errors import Conflict
@@ -113,6 +111,16 @@ def test_a_key_can_be_given_an_end_but_not_in_the_past(service):
     assert service.refused(answer, 422, "invalid-request")["errors"][0]["where"] == "expires_at"
 
 
+@pytest.mark.parametrize("date", ["9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+14:00", "9000-01-01T00:00:01Z"])
+def test_a_date_at_the_edge_of_the_calendar_is_refused(service, date):
+    """In another zone it would be outside."""
+    answers = [service.http.post("/v1/keys", json={"name": "x", "scope": "read", "expires_at": date})]
+    answers += [service.http.post("/v1/webhooks/whk_none/replay", json={"since": date})]
+    for answer, field in zip(answers, ("expires_at", "since"), strict=True):
+        error = service.refused(answer, 422, "invalid-request")["errors"][0]
+        assert error["where"] == field and "1970 and 9000" in error["what"]
+
+
 def test_secrets_in_the_query_open_nothing(service):
     secret = made(service)["secret"]
     for name in ("token", "access_token", "key"):
@@ -174,16 +182,6 @@ def test_a_project_is_deleted_when_it_is_empty_and_its_keys_end(service):
     service.refused(service.http.get("/v1/me", headers=there), 422, "invalid-request")
     assert service.http.post("/v1/projects", json={"name": name}).status_code == 201, "the name is free again"
     service.refused(service.http.delete(f"/v1/projects/{DEFAULT_PROJECT}"), 409, "conflict")
-
-
-@pytest.fixture
-def replica(service):
-    """Another API process' app on the same catalog, which believes for long what it has read about a key."""
-    settings = service.settings.model_copy(update={"key_cache_seconds": 3600.0})
-    app = create_app(settings)
-    yield TestClient(app, base_url="http://127.0.0.1")
-    app.state.services.catalog.dispose()
-    app.state.services.queue.close()
 
 
 def test_a_key_revoked_elsewhere_makes_no_successor(service, replica):

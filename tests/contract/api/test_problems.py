@@ -129,6 +129,8 @@ def test_a_service_cut_off_lives_and_says_what_is_missing(service, cut_off):
     answer = httpx.get(f"{cut_off}/readyz", timeout=30)
     document = service.refused(answer, 503, "not-ready")
     assert {error["where"] for error in document["errors"]} == {"catalog", "store", "queue"}
+    assert {error["what"] for error in document["errors"]} == {"it does not answer"}
+    assert "127.0.0.1" not in answer.text, "where they are is nothing for strangers"
     assert int(answer.headers["retry-after"]) > 0
 
 
