@@ -27,7 +27,7 @@ from l3ps_api.keyring import Keyring
 from l3ps_api.keys import service as key_service
 from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
-from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
+from l3ps_api.middleware import LoopbackHosts, RequestMetrics, SizeLimits
 from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
@@ -128,7 +128,7 @@ def create_app(settings: Settings) -> FastAPI:
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
-    app.add_middleware(BodyLimit, exempt="/v1/objects/")
+    app.add_middleware(SizeLimits, exempt="/v1/objects/")
     app.add_middleware(errors.Problems)
     if settings.loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
