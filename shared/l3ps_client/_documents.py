@@ -202,6 +202,7 @@ class Upload(TypedDict):
     part_size: NotRequired[int]
     parts: NotRequired[list[PartUrl]]
     received: NotRequired[list[ReceivedPart]]
+    joined: NotRequired[bool]
 
 
 class LabelFile(TypedDict):
@@ -222,6 +223,7 @@ class LabelFiles(TypedDict):
     job_id: str
     format: str
     files: list[LabelFile]
+    next: NotRequired[str | None]
 
 
 class Me(TypedDict):

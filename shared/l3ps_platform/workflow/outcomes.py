@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
-from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
 from l3ps_platform.workflow import notices
@@ -172,13 +172,18 @@ def release(tx: Transaction, claim: Claim) -> None:
         enqueue(tx, stage)
 
 
-def release_owned(tx: Transaction, owner_prefix: str) -> int:
-    """Give back every stage whose owner's name begins so; how many. For a worker that was made to stop in mid-stage."""
-    mine = StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
+def release_owned(catalog: Catalog, owner_prefix: str) -> int:
+    """Give back every stage whose owner's name begins so; how many. For a worker that was made to stop in mid-stage.
+
+    One transaction for each: workers that stop together hold stages of the same jobs, each in an order of its own.
+    """
+    with catalog.reading() as session:
+        held = stages.owned(session, owner_prefix)
     count = 0
-    for stage in list(tx.session.scalars(select(StageRow).where(StageRow.state == StageState.RUNNING, mine))):
-        with suppress(LeaseLost):
-            release(tx, Claim(stage.id, stage.attempt, stage.lease_owner or "", stage.name, 0.0))
+    for stage_id, owner in held:
+        with suppress(LeaseLost), catalog.transaction() as tx:
+            stage = stages.get(tx.session, stage_id)
+            release(tx, Claim(stage_id, stage.attempt, owner, stage.name, 0.0))
             count += 1
     return count
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import structlog
 from sqlalchemy.orm import Session
@@ -27,6 +28,8 @@ _STEPS = (
     *("features", "train", "export", "validate"),
 )
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
+_LOOKS = 16
+"""Objects looked for at a time. Of a job whose every scene failed there may be 850."""
 
 
 def create(services: Services, project_id: str, request: JobRequest) -> Job:
@@ -105,11 +108,15 @@ def cancel(services: Services, job_id: str) -> Job:
 
 
 def retry(services: Services, job_id: str) -> Job:
-    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected;
+    429 where as many are under way as may be."""
     with services.catalog.reading() as session:
+        check_active_jobs(services, session)
         wanted = outputs_to_keep(session, job_id)
-    gone = [key for key in wanted if not services.store.exists(key)]
+    with ThreadPoolExecutor(_LOOKS) as pool:
+        gone = [key for key, there in zip(wanted, pool.map(services.store.exists, wanted), strict=True) if not there]
     with services.catalog.transaction() as tx:
+        check_active_jobs(services, tx.session)
         retry_job(tx, job_id, gone)
         note_result(tx.session, "jobs", job_id)
     return get(services, job_id)

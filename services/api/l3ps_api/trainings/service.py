@@ -103,8 +103,9 @@ def cancel(services: Services, training_id: str) -> Training:
 
 
 def retry(services: Services, training_id: str) -> Training:
-    """Run a failed or cancelled training again. NotFound, Conflict for another."""
+    """Run a failed or cancelled training again. NotFound, Conflict for another; 429 where too many are under way."""
     with services.catalog.transaction() as tx:
+        check_active_jobs(services, tx.session)
         retry_training(tx, training_id)
         note_result(tx.session, "trainings", training_id)
     return get(services, training_id)
