@@ -47,6 +47,11 @@ def page(session: Session, *, limit: int = 50, before: str | None = None) -> lis
     return queries.page(session, RuleRow, limit=limit, before=before)
 
 
+def count(session: Session) -> int:
+    """How many there are."""
+    return session.scalar(select(func.count(RuleRow.id))) or 0
+
+
 def of_buckets(session: Session, buckets: Iterable[str]) -> list[RuleRow]:
     """The rules for these buckets."""
     return list(session.scalars(select(RuleRow).where(RuleRow.bucket.in_(set(buckets))).order_by(RuleRow.id)))

@@ -26,6 +26,12 @@ def of_job(session: Session, job_id: str) -> list[StageRow]:
     return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
 
 
+def publishing(session: Session, job_id: str) -> StageRow | None:
+    """The stage that publishes a job, where it has been planned."""
+    query = select(StageRow).where(StageRow.job_id == job_id, StageRow.name == StageName.PUBLISH)
+    return session.scalars(query).one_or_none()
+
+
 def of_job_and_drive(session: Session, job_id: str, drive_id: str) -> list[StageRow]:
     """The stages that a job's client sees: the check of its drive, and :func:`of_job`."""
     seen = or_(StageRow.job_id == job_id, StageRow.drive_id == drive_id)

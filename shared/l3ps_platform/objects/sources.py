@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import BinaryIO, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -118,13 +119,16 @@ def parse_sources(text: str) -> tuple[Source, ...]:
     return tuple(sources)
 
 
+_parsed = lru_cache(maxsize=1)(parse_sources)
+
+
 def find_source(settings: Settings, reference: Reference, project_id: str) -> Source | None:
     """The source through which a project may read a place; None where there is none.
 
     The narrowest source around a place decides: what is one project's alone is no other's through a wider source, nor
     as a part of a larger place.
     """
-    sources = parse_sources(settings.sources.get_secret_value())
+    sources = _parsed(settings.sources.get_secret_value())
     around = [source for source in sources if source.covers(reference)]
     narrowest = max((len(source.path) for source in around), default=0)
     deciding = [source for source in around if len(source.path) == narrowest]

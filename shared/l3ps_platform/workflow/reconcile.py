@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
 import structlog
@@ -18,7 +18,7 @@ from sqlalchemy import ColumnElement, select, update
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import StageRow
 from l3ps_platform.catalog.session import Catalog, Transaction
-from l3ps_platform.catalog.states import StageState
+from l3ps_platform.catalog.states import StageName, StageState
 from l3ps_platform.errors import CatalogUnavailable
 from l3ps_platform.settings import Settings
 from l3ps_platform.workflow.arrivals import settle_arrivals
@@ -44,6 +44,7 @@ class Report:
     """How much one round put right."""
 
     expired: int = 0
+    hanging: int = 0
     retried: int = 0
     resent: int = 0
     spent: int = 0
@@ -68,6 +69,7 @@ class Reconciler:
         self._leases_count_from = float("-inf")
         self._steps: dict[str, Callable[[], int]] = {
             "expired": self._expire_leases,
+            "hanging": self._end_hanging,
             "retried": self._release_retries,
             "resent": self._resender.run_once,
             "spent": self._drop_spent,
@@ -109,6 +111,22 @@ class Reconciler:
         for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
             with self.chore.row("expired", stage_id), self._catalog.transaction() as tx:
                 count += lease_lost(tx, stage_id, self._retry, expired_before=tx.now)
+        return count
+
+    def _end_hanging(self) -> int:
+        """End what runs beyond its time limit under a lease that goes on: its worker ought to have ended it."""
+        count = 0
+        for training in (True, False):
+            limit = self._settings.train_seconds if training else self._settings.stage_seconds
+            kind = (StageRow.name == StageName.TRAIN) if training else (StageRow.name != StageName.TRAIN)
+            # Two leases later than the worker: by then it has ended the stage, or has lost it.
+            since = self._now() - timedelta(seconds=limit + 2 * self._settings.lease_seconds)
+            reason = f"it ran for more than {limit:.0f} s and its worker did not stop it"
+            for stage_id in self._ids(StageRow.state == StageState.RUNNING, kind, StageRow.started_at < since):
+                with self.chore.row("hanging", stage_id), self._catalog.transaction() as tx:
+                    count += lease_lost(
+                        tx, stage_id, self._retry, started_before=since, reason=reason, cause=Cause.TIMEOUT
+                    )
         return count
 
     def _release_retries(self) -> int:
@@ -165,6 +183,7 @@ def lease_lost(
     retry: Retry,
     *,
     expired_before: datetime | None = None,
+    started_before: datetime | None = None,
     owner_prefix: str | None = None,
     reason: str | None = None,
     cause: Cause = Cause.LEASE_LOST,
@@ -176,6 +195,7 @@ def lease_lost(
         stage_id: the stage.
         retry: how often it may be tried.
         expired_before: only if its lease ended before this.
+        started_before: only if it began before this.
         owner_prefix: only if its owner's name begins so (a worker's main process reports its own dead child).
         reason: what to tell the user.
         cause: and in one word.
@@ -187,6 +207,8 @@ def lease_lost(
     conditions = [StageRow.id == stage_id, StageRow.state == StageState.RUNNING]
     if expired_before is not None:
         conditions.append(StageRow.lease_until < expired_before)
+    if started_before is not None:
+        conditions.append(StageRow.started_at < started_before)
     if owner_prefix is not None:
         conditions.append(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
     error = LOST if reason is None else failure(reason, cause)

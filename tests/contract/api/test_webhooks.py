@@ -286,7 +286,9 @@ def test_an_address_that_has_become_forbidden_is_refused_at_the_delivery(service
             webhooks.lock(tx.session, hook["id"]).url = f"http://127.0.0.2:{port}/hook"
         row = delivered(hook, ping(hook))
     assert row["state"] == "failed"
-    assert {attempt["error"] for attempt in row["log"]} == {"not sent: '127.0.0.2' is not a public address"}
+    assert {attempt["error"] for attempt in row["log"]} == {
+        "not sent: '127.0.0.2' is no public address and no name of one"
+    }
     assert receiver.got.empty()
 
 

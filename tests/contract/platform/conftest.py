@@ -163,9 +163,7 @@ class Play:
         """Claim the stage of a message, the next one sent by default."""
         message = message or self.sent.pop(0)
         with self.catalog.transaction() as tx:
-            return workflow.claim(
-                tx, message.stage_id, message.attempt, owner, lease_seconds=lease, max_attempts=MAX_ATTEMPTS
-            )
+            return workflow.claim(tx, message.stage_id, message.attempt, owner, lease_seconds=lease)
 
     def run(self, end: Callable[[Transaction, workflow.Claim], None], message: StageMessage | None = None) -> None:
         """Claim the stage of a message and end it."""
@@ -198,7 +196,6 @@ class Play:
             return catalog_stages.get(session, id)
 
 
-MAX_ATTEMPTS = 3
 COST = workflow.Cost(1.5, 2.5, 100.0, scans=2, points=10, steps={"vote": (0.5, 50.0)})
 
 

@@ -42,15 +42,15 @@ def test_a_dead_worker_s_stage_is_tried_again_and_the_job_succeeds(tidy, play, s
     assert play.job(job).state is JobState.SUCCEEDED
 
 
-def test_a_stage_that_kills_every_worker_fails_with_a_reason(tidy, play, sent) -> None:
-    job = play.submit(scenes=1)
-    for _ in range(3):
-        play.take(lease=-1)
-        tidy(retry_seconds=0)
-    assert not sent
-    row = play.job(job)
-    assert row.state is JobState.FAILED
-    assert "stopped answering" in row.error["message"]
+def test_a_stage_far_beyond_its_time_limit_is_not_held_by_its_lease(tidy, play, sent) -> None:
+    """Its worker ought to have ended it at the limit and goes on to prolong its lease."""
+    play.submit(scenes=1)
+    claim = play.take(lease=3600.0)
+    assert tidy(stage_seconds=3600.0, lease_seconds=0.0, train_seconds=0.001).hanging == 0
+    assert tidy(stage_seconds=0.0, lease_seconds=0.0).hanging == 1
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "timeout")
+    assert "its worker did not stop it" in stage.error["message"]
 
 
 def test_a_live_lease_is_left_alone(tidy, play, sent) -> None:
@@ -140,9 +140,10 @@ def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     with play.catalog.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
     tidy.store.put_bytes("uploads/u/d.zip", b"archive")
+    crashed = workflow.failure("it was killed", workflow.Cause.CRASHED)
     for _ in range(3):
-        play.take(lease=-1)
-        tidy(retry_seconds=0)
+        play.run(lambda tx, claim: workflow.fail(tx, claim, crashed, retry=Retry(3, 0)))
+        tidy()
     tidy.sweep()
     with play.catalog.reading() as session:
         row = drives.get(session, drive.id)
@@ -185,7 +186,7 @@ def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
     """Their parts leave the store; a fresh one stays."""
     made = {}
     for name, seconds in (("old", -1), ("new", 3600)):
-        upload_id = tidy.store.create_multipart(f"u/{name}")
+        upload_id = tidy.store.create_multipart(f"u/{name}", 5 << 20)
         with catalog.transaction() as tx:
             row = uploads.add(
                 tx,

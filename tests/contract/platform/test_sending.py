@@ -102,7 +102,7 @@ def test_a_certificate_of_another_name_is_not_taken(receiver) -> None:
 
 def test_one_forbidden_address_beside_an_allowed_one_forbids_the_name(receiver) -> None:
     answer = send(f"{receiver.scheme}://hooks.example:{receiver.port}/x", Names("127.0.0.1 127.0.0.2"))
-    assert answer.error == "not sent: 'hooks.example' is not a public address"
+    assert answer.error == "not sent: 'hooks.example' is no public address and no name of one"
     assert receiver.hosts == []
 
 

@@ -228,7 +228,7 @@ def test_what_nobody_owns_goes_after_a_day_and_what_somebody_owns_stays(house) -
     }
     for key in orphans:
         house.store.put_bytes(f"{key}/file", b"x")
-    lost = house.store.create_multipart("uploads/upl_y/archive")
+    lost = house.store.create_multipart("uploads/upl_y/archive", 5 << 20)
     house.sweep()
     house.sweep()
     assert house.groups() == orphans | stage_keys("a") | {f"jobs/{job}"}, "it may be somebody's in a moment"
