@@ -38,10 +38,12 @@ from l3ps_platform.ids import new_id
 from l3ps_platform.objects import DirectoryStore
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
+from l3ps_platform.webhooks.deliverer import SHARE
 from l3ps_platform.workflow import Retry, deliveries
 
 SCENES = 8
-MESSAGES = 20
+HOOKS = 5
+MESSAGES = 8
 
 
 class Place:
@@ -54,12 +56,14 @@ class Place:
         self.store = DirectoryStore(folder, "")
         self.store.ensure()
         self.received: Counter[str] = Counter()
+        self.answers = threading.Event()
         place = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 self.rfile.read(int(self.headers["content-length"]))
                 place.received[self.headers["webhook-id"]] += 1
+                place.answers.wait()
                 self.send_response(204)
                 self.end_headers()
 
@@ -75,12 +79,13 @@ class Place:
             settings_ = {"model": "model"}
             self.rule = rules.add(tx, name="rule", bucket="fleet", prefix="", suffix=None, settings=settings_)
             url = f"http://127.0.0.1:{self.server.server_port}/"
-            hook = WebhookRow(id=new_id("whk"), url=url, secret="whsec_AAAA", events=["scene.done"], created_at=tx.now)
-            hook.enabled = True
-            tx.session.add(hook)
-        self.hook = hook.id
+            named = {"url": url, "secret": "whsec_AAAA", "events": ["scene.done"], "enabled": True}
+            hooks = [WebhookRow(id=new_id("whk"), created_at=tx.now, **named) for _ in range(HOOKS)]
+            tx.session.add_all(hooks)
+        self.hooks = [hook.id for hook in hooks]
 
     def close(self) -> None:
+        self.answers.set()
         self.server.shutdown()
         self.thread.join()
         self.server.server_close()
@@ -126,8 +131,9 @@ class Place:
                 workflow.fail(tx, claim, error, retry=Retry(3, 0))
         self.deleted_job(f"labels-{number}")
         with self.catalog.transaction() as tx:
-            for _ in range(MESSAGES):
-                deliveries.ping(tx, webhooks.lock(tx.session, self.hook))
+            for hook in sorted(self.hooks):
+                for _ in range(MESSAGES):
+                    deliveries.ping(tx, webhooks.lock(tx.session, hook))
             arrived = [(self.rule, f"{number}{n}" * 16, f"{number}-{n}", f"s3://fleet/{number}-{n}") for n in range(5)]
             rules.note(tx, arrived)
         return lost | {claim.stage_id for claim in failed}
@@ -164,11 +170,13 @@ def until(true: Callable[[], bool]) -> None:
 
 def test_two_api_processes_do_everything_once(place, api_process, postgres_url, redis_url) -> None:
     first = {row.id for row in place.job(hours=1)}
-    second = place.wave(1)
     settings = {"database_url": postgres_url, "redis_url": redis_url, "objects_url": place.store.root.as_uri()}
     settings |= {"reconcile_seconds": "0.1", "lease_seconds": "0.5", "webhook_allow": "127.0.0.1/32"}
     for _ in range(2):
         api_process(**settings, webhook_http="1", token="operator")
+    second = place.wave(1)
+    until(lambda: place.received.total() >= 2 * SHARE)  # no process holds more than its share: both are at work
+    place.answers.set()
     until(place.settled)
     # By the time that these are done, whatever was begun twice of the others has shown.
     second |= place.wave(2)
@@ -188,5 +196,5 @@ def test_two_api_processes_do_everything_once(place, api_process, postgres_url, 
         assert session.scalar(retried) == len(second)
         rows = session.scalars(select(DeliveryRow)).all()
         assert {(row.state, row.attempt) for row in rows} == {(DeliveryState.DELIVERED, 1)}
-    assert place.received == dict.fromkeys([row.id for row in rows], 1) and len(rows) == 2 * MESSAGES
+    assert place.received == dict.fromkeys([row.id for row in rows], 1) and len(rows) == 2 * HOOKS * MESSAGES
     assert list(place.store.list()) == []
