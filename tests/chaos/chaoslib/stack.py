@@ -97,6 +97,8 @@ class Service:
         self.folder, self.servers, self.workload, self.note = folder, servers, workload, note
         self.patient = points is not None
         self._undo = ExitStack()
+        self.witness = Receiver("127.0.0.1", witness)
+        self._undo.callback(self.witness.close)  # last, behind those who talk to it
         self.processes = self._undo.enter_context(Processes(folder / "logs"))
         (folder / "sabotage").mkdir(parents=True)
         places = self._places(rules)
@@ -116,8 +118,6 @@ class Service:
         self.jobs: dict[str, Case] = {}
         self.drives: list[str] = []
         self._again: dict[str, Callable[[], Child]] = {}
-        self.witness = Receiver("127.0.0.1", witness)
-        self._undo.callback(self.witness.close)
 
     def _places(self, rules: Sequence[Rule]) -> dict[str, Any]:
         """The settings that say where things are."""
