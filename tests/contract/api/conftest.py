@@ -15,6 +15,7 @@ import psycopg
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from tests.conftest import wait_until
+from tests.contract.api.receivers import delivered, hooked, ping, receiver  # noqa: F401  (fixtures)
 from typer.testing import CliRunner
 
 from l3ps_cli.main import app
