@@ -10,7 +10,7 @@ from importlib.metadata import version
 import structlog
 from fastapi import Depends, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
-from prometheus_client import CollectorRegistry, Gauge, ProcessCollector
+from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 
 from l3ps_api import errors
 from l3ps_api.access_log import AccessLog
@@ -38,7 +38,9 @@ from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
+from l3ps_api.system.checks import check_all
 from l3ps_api.system.routes import router as system
+from l3ps_api.system.shared import Shared
 from l3ps_api.trainings.routes import router as trainings
 from l3ps_api.uploads import service as upload_service
 from l3ps_api.uploads.routes import router as uploads
@@ -46,13 +48,14 @@ from l3ps_api.webhooks import service as webhook_service
 from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.chore_metrics import ChoreCollector
 from l3ps_platform.errors import StoreUnavailable
 from l3ps_platform.metrics import CatalogCollector, DiskCollector
 from l3ps_platform.objects import open_store, parse_sources
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 from l3ps_platform.webhooks import Deliverer
-from l3ps_platform.workflow import Reconciler
+from l3ps_platform.workflow import Reconciler, Sweeper
 
 log = structlog.get_logger(__name__)
 
@@ -99,8 +102,14 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))
     ProcessCollector(registry=app.state.registry)
+    app.state.chores = (
+        Reconciler(catalog, queue, settings), Sweeper(catalog, services.store, settings), Deliverer(catalog, settings)
+    )  # fmt: skip
+    app.state.registry.register(ChoreCollector([one.chore for one in app.state.chores]))
     streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
     streams.set_function(lambda: app.state.events.places.taken)
+    app.state.metrics = Shared(lambda: generate_latest(app.state.registry))
+    app.state.readiness = Shared(lambda: check_all(services))
     app.state.turns = Turns(TURNS, WAITING)
     guarded = [Depends(authenticate), Depends(_turn, scope="function")]
     app.include_router(system)
@@ -148,20 +157,18 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     except StoreUnavailable as error:
         log.warning("object store not reached at the start, /readyz tries again", reason=str(error))
     stop = threading.Event()
-    reconciler = Reconciler(services.catalog, services.queue, services.store, services.settings)
-    deliverer = Deliverer(services.catalog, services.settings)
-    chores = [
-        threading.Thread(target=run, args=(stop,), name=name, daemon=True)
-        for name, run in (("reconciler", reconciler.run), ("deliverer", deliverer.run))
+    threads = [
+        threading.Thread(target=worker.run, args=(stop,), name=worker.chore.name, daemon=True)
+        for worker in app.state.chores
     ]
-    for chore in chores:
-        chore.start()
+    for thread in threads:
+        thread.start()
     try:
         yield
     finally:
         stop.set()
         app.state.events.close()
-        for chore in chores:
-            await run_in_threadpool(chore.join, 10)
+        for thread in threads:
+            await run_in_threadpool(thread.join, 10)
         services.catalog.dispose()
         services.queue.close()

@@ -92,6 +92,7 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
         Conflict: it has succeeded or is not over, its name was taken meanwhile, or its annotations are gone.
     """
     training = trainings.get(tx.session, training_id)
+    gone = _hold_annotations(tx, training)
     holder = bundles.named(tx.session, training.name, training.project_id)
     training = trainings.lock(tx.session, training_id)
     if training.state not in _AGAIN:
@@ -101,10 +102,8 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
     under_way = trainings.unfinished(tx.session, training.name)
     if under_way is not None:
         raise Conflict(f"training {under_way.id} is to become model {training.name!r}: wait for it, or cancel it")
-    for id in (training.annotations_id, training.validation_id):
-        given = annotation_sets.lock(tx.session, id) if id is not None else None
-        if given is not None and (given.deleted_at is not None or given.object_key is None):
-            raise Conflict(f"the archive of annotations {id} is gone: upload it again and start a new training")
+    if gone is not None:
+        raise Conflict(f"the archive of annotations {gone} is gone: upload it again and start a new training")
     training.state, training.cancel_requested, training.error = JobState.QUEUED, False, None
     training.started_at = training.finished_at = None
     notices.of_parent(tx, training)
@@ -112,6 +111,17 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
     _reset(tx, stage)
     enqueue(tx, stage)
     return training
+
+
+def _hold_annotations(tx: Transaction, training: TrainingRow) -> str | None:
+    """Hold what a training learns from, before its model's name, as who starts one does; the first that is gone."""
+    for id in sorted({training.annotations_id, training.validation_id or training.annotations_id}):
+        try:
+            if annotation_sets.lock(tx.session, id).object_key is None:
+                return id
+        except NotFound:
+            return id
+    return None
 
 
 def _last_done(own: Sequence[StageRow]) -> StageRow | None:
@@ -135,8 +145,9 @@ def _reset(tx: Transaction, stage: StageRow) -> None:
     """A stage as when it was planned, but for the number of its attempt."""
     stage.state = StageState.WAITING
     stage.attempt += 1
-    stage.failures = 0
-    stage.outage_since = stage.not_before = stage.finished_at = stage.started_at = None
+    stage.failures = stage.losses = 0
+    stage.outage_seconds = 0.0
+    stage.not_before = stage.finished_at = stage.started_at = None
     stage.error = stage.output_key = stage.progress_step = None
     stage.progress_done = stage.progress_total = 0
     stage.fraction = 0.0

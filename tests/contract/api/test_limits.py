@@ -7,6 +7,9 @@ from contextlib import ExitStack
 import httpx
 import pytest
 
+from l3ps_api.keyring import new_secret
+from l3ps_platform.ids import new_id
+
 TOKEN = secrets.token_urlsafe(32)
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
 
@@ -18,9 +21,10 @@ BURST = 16
 def strict(api_process, redis_server) -> str:
     """An API that lets each key ask so often, and again after minutes."""
     limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
-    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1", "event_streams": "4"}
+    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_open_upload_bytes": "1000", "max_active_jobs": "1"}
     redis_url = redis_server.removesuffix("/0") + "/4"
-    return api_process(token=TOKEN, redis_url=redis_url, training="1", **limits, **quotas)
+    others = {"event_streams": "4", "trusted_proxies": "127.0.0.1", "training": "1"}
+    return api_process(token=TOKEN, redis_url=redis_url, **limits, **quotas, **others)
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +75,16 @@ def test_a_project_has_so_many_open_uploads_and_may_go_on_when_one_is_closed(fre
     assert again.status_code == 201, "a refusal for now is not kept with the key"
 
 
+def test_a_project_has_so_many_bytes_in_open_uploads(fresh):
+    """The disk is everybody's: what is announced counts, from the announcement to the completion."""
+    with fresh() as http:
+        first = http.post("/v1/uploads", json=UPLOAD | {"size": 900})
+        document = refused(http.post("/v1/uploads", json=UPLOAD | {"size": 101}), "quota-reached")
+        assert document["errors"][0]["where"] == "size" and "900 bytes" in document["errors"][0]["what"]
+        assert http.delete(first.headers["location"]).status_code == 204
+        assert http.post("/v1/uploads", json=UPLOAD | {"size": 101}).status_code == 201
+
+
 def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
     announced = UPLOAD | {"kind": "annotations", "size": 22}
     with fresh() as http:
@@ -109,10 +123,21 @@ def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_onc
         assert open_stream(greedy).status_code == 200
 
 
-def test_wrong_credentials_are_limited_by_address_and_right_ones_that_are_known_are_not(fresh, strict):
+def test_wrong_credentials_are_limited_by_address_and_right_ones_pass_all_the_same(fresh, strict):
+    """Also right ones that the process has not seen before: their holder may share an address with whoever guesses."""
+    guesses = [guess(strict, str(n)) for n in range(3)] + [guess(strict, new_secret(new_id("key"))) for _ in range(3)]
+    assert [answer.status_code for answer in guesses] == [401] * 3 + [429] * 3
+    refused(guesses[-1], "too-many-requests")
     with fresh() as http:
-        assert http.get("/v1/me").is_success
-        guesses = [httpx.get(f"{strict}/v1/me", headers={"Authorization": f"Bearer {n}"}) for n in range(6)]
-        assert [answer.status_code for answer in guesses] == [401] * 3 + [429] * 3
-        refused(guesses[-1], "too-many-requests")
-        assert http.get("/v1/me").is_success
+        assert [http.get("/v1/me").status_code for _ in range(3)] == [200] * 3
+    assert guess(strict, "one more").status_code == 429
+
+
+def test_behind_a_known_proxy_clients_are_told_apart_by_the_address_it_names(strict):
+    there, elsewhere = ({"X-Forwarded-For": address} for address in ("198.51.100.1", "198.51.100.2"))
+    assert [guess(strict, "x", there).status_code for _ in range(5)] == [401] * 3 + [429] * 2
+    assert guess(strict, "x", elsewhere).status_code == 401
+
+
+def guess(url: str, secret: str, headers: dict | None = None) -> httpx.Response:
+    return httpx.get(f"{url}/v1/me", headers={"Authorization": f"Bearer {secret}"} | (headers or {}))

@@ -81,11 +81,8 @@ def test_410_switches_a_webhook_off_until_it_is_switched_on(service, receiver, h
     hook = hooked(receiver.url)
     id = ping(hook)
     assert delivered(hook, id)["attempts"] == 1
-    assert watcher.next().document["data"] == {
-        "id": hook["id"],
-        "url": receiver.url,
-        "reason": "the receiver answered 410: it wants no more messages",
-    }
+    reason = "the receiver answered 410: it wants no more messages"
+    assert watcher.next().document["data"] == {"id": hook["id"], "reason": reason}, "a URL may be a secret"
     watcher.close()
     shown = service.http.get(f"/v1/webhooks/{hook['id']}").json()
     assert not shown["enabled"] and "410" in shown["disabled_reason"]

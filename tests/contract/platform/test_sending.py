@@ -114,6 +114,18 @@ def test_another_address_is_tried_where_one_does_not_answer(receiver) -> None:
     assert closed.status is None and "ConnectError" in closed.error
 
 
+def test_what_nobody_foresaw_counts_as_an_attempt() -> None:
+    """What is not counted would be made again for ever."""
+
+    def broken(host: str, port: int) -> list[str]:
+        raise ZeroDivisionError
+
+    assert send("https://hooks.example/x", broken).error == "not sent: the service failed (ZeroDivisionError)"
+    guard = Guard(resolver=Names("1.1.1.1"))
+    answer = asyncio.run(sending.attempt(guard, "https://hooks.example/x", ["no secret"], "msg_1", b"{}", 5))
+    assert answer.error is not None and answer.error.startswith("not sent: the service failed")
+
+
 def test_proxies_of_the_environment_are_not_used(receiver, monkeypatch) -> None:
     with socket.socket() as proxy:
         proxy.bind(("127.0.0.1", 0))

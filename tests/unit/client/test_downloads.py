@@ -190,7 +190,7 @@ def test_an_url_that_never_works_is_a_refusal(tmp_path):
             store.client.labels.download("job_1", tmp_path)
 
 
-@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../x", "", "a\\..\\x"])
+@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../x", "", "a\\..\\x", "C:x"])
 def test_no_listing_makes_a_download_write_elsewhere(tmp_path, path):
     with store_of(good=b"0123") as store:
         store.files[path] = b"evil"

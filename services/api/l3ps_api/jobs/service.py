@@ -19,7 +19,7 @@ from l3ps_api.sources import permitted
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
 from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import Conflict
-from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
+from l3ps_platform.workflow import MAX_PROBLEMS, accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
 
 log = structlog.get_logger(__name__)
 
@@ -47,6 +47,7 @@ def create(services: Services, project_id: str, request: JobRequest) -> Job:
     except InputError as error:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
+        count = f"at least {count}" if len(found) == MAX_PROBLEMS else count
         skippable = all(problem.severity == "scan" for problem in found)
         remedy = (
             "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."

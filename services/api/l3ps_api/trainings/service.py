@@ -68,6 +68,8 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
         models = bundles.many(session, [row.model_id or "" for row in shown])
         work = stages.of_trainings(session, [row.id for row in shown])
     items = [TrainingSummary(**summary_fields(row, sets, models, work[row.id].fraction)) for row in shown]
+    for item in items:
+        item.settings = {name: value for name, value in item.settings.items() if name != "classes"}
     return TrainingPage(items=items, next=following)
 
 

@@ -32,6 +32,7 @@ async def create_webhook(request: WebhookRequest, response: Response, services: 
     await service.admit(services, request.url)
     webhook = await run_in_threadpool(service.create, services, request)
     response.headers["Location"] = f"/v1/webhooks/{webhook.id}"
+    response.headers["Cache-Control"] = "no-store"
     return webhook
 
 

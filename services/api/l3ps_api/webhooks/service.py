@@ -102,8 +102,7 @@ def change(services: Services, webhook_id: str, request: WebhookChange) -> Webho
 
 def delete(services: Services, webhook_id: str) -> None:
     """Forget a webhook and its deliveries. NotFound."""
-    with services.catalog.transaction() as tx:
-        tx.session.delete(webhooks.get(tx.session, webhook_id))
+    deliveries.forget(services.catalog, webhook_id)
 
 
 def rotate(services: Services, webhook_id: str, overlap_seconds: int) -> NewWebhook:
@@ -149,9 +148,7 @@ def replay(services: Services, webhook_id: str, delivery_id: str) -> Delivery:
 
 def replay_failed(services: Services, webhook_id: str, since: datetime) -> Replayed:
     """Make all failed deliveries since a date again. NotFound, Conflict where the webhook is switched off."""
-    with services.catalog.transaction() as tx:
-        hook = webhooks.lock(tx.session, webhook_id)
-        return Replayed(count=deliveries.replay(tx, hook, webhooks.failed_since(tx.session, webhook_id, since)))
+    return Replayed(count=deliveries.replay_failed(services.catalog, webhook_id, since))
 
 
 def _with_secret(row: WebhookRow) -> NewWebhook:
