@@ -16,6 +16,7 @@ import pytest
 from fastapi.testclient import TestClient
 from onnx import TensorProto, helper, numpy_helper
 from tests.conftest import wait_until
+from tests.contract.api.receivers import delivered, hooked, ping, receiver  # noqa: F401  (fixtures)
 from typer.testing import CliRunner
 
 from l3ps_api.app import create_app
