@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from composecheck import kills, looks
+from composecheck import copies, kills, looks
 from composecheck.command import ROOT, CheckError
 from composecheck.engine import engine
 from composecheck.images import provide
@@ -114,6 +114,10 @@ def exercise(report: Report, stack: Stack, options: argparse.Namespace, work: Pa
             stack.cli(*words, fresh, seconds=300)
             with report.step(f"kill -9 of {victim} in the middle of a job") as facts:
                 facts.append(kills.kill(stack, victim, fresh, options.model))
+    other = work / "drive-copied"
+    stack.cli("simulate", "--scenes", "2", "--scans", "3", "--seed", str(SEED - 1), "--out", other, seconds=300)
+    with report.step("back-up in the middle of a job, all volumes lost, restore") as facts:
+        facts.append(copies.lose_all_and_restore(stack, job, drive, other, options.model))
     with report.step("down, up again, labels still there") as facts:
         stack.down()
         stack.up()

@@ -33,7 +33,7 @@ def kill(stack: Stack, victim: str, drive: Path, model: str) -> str:
     """
     job = json.loads(stack.cli("submit", drive, "--model", model, "--json"))["id"]
     stage = _AT_WORK.get(victim)
-    _until(lambda: _at_work(stack, job, stage), JOB_SECONDS, f"Job {job} never had a {stage or 'stage'} at work.")
+    until(lambda: at_work(stack, job, stage), JOB_SECONDS, f"Job {job} never had a {stage or 'stage'} at work.")
     before = _container(stack, victim)
     began = time.monotonic()
     try:
@@ -41,9 +41,9 @@ def kill(stack: Stack, victim: str, drive: Path, model: str) -> str:
     except PermissionError as error:
         # `docker kill` would not do: the engine takes it for a stop that was meant, and starts nothing again.
         raise CheckError("killing a container's process takes the rights of root: run this check with them") from error
-    _until(lambda: _is_back(stack, victim, before), BACK_SECONDS, f"{victim} did not come back.")
+    until(lambda: _is_back(stack, victim, before), BACK_SECONDS, f"{victim} did not come back.")
     back = time.monotonic() - began
-    _until(lambda: _over(stack, job), JOB_SECONDS, f"Job {job} did not end after the death of {victim}.")
+    until(lambda: over(stack, job), JOB_SECONDS, f"Job {job} did not end after the death of {victim}.")
     ended = stack.get(f"/v1/jobs/{job}")
     if ended["state"] != "succeeded":
         raise CheckError(f"Job {job} ended {ended['state']} after the death of {victim}: {ended['message']}")
@@ -53,7 +53,8 @@ def kill(stack: Stack, victim: str, drive: Path, model: str) -> str:
     return f"back after {back:.0f} s, job succeeded {whole:.0f} s after the kill with {attempts} attempts at most"
 
 
-def _at_work(stack: Stack, job: str, name: str | None) -> bool:
+def at_work(stack: Stack, job: str, name: str | None) -> bool:
+    """Whether a stage of this name, or any, runs; CheckError when the job is over."""
     document = stack.get(f"/v1/jobs/{job}")
     if document["state"] in ("succeeded", "failed", "cancelled"):
         raise CheckError(f"Job {job} was {document['state']} before anything was killed.")
@@ -74,12 +75,13 @@ def _is_back(stack: Stack, service: str, before: dict[str, Any]) -> bool:
     return bool(fresh and state.get("Health", {}).get("Status", "healthy") == "healthy")
 
 
-def _over(stack: Stack, job: str) -> bool:
+def over(stack: Stack, job: str) -> bool:
+    """Whether the job has ended, well or not."""
     return stack.get(f"/v1/jobs/{job}")["state"] in ("succeeded", "failed", "cancelled")
 
 
-def _until(ready: Callable[[], bool], seconds: float, otherwise: str) -> None:
-    """Wait for something to be true; an API that does not answer just now is no answer."""
+def until(ready: Callable[[], bool], seconds: float, otherwise: str) -> None:
+    """Wait for something to be true; an API that does not answer is no answer. CheckError after ``seconds``."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         with suppress(OSError):

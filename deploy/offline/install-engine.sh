@@ -5,7 +5,7 @@
 # line plugins, so they are taken out of Debian 13's packages. `docker` itself and its services are left as they are.
 set -eu
 apt-get update
-apt-get install --yes --no-install-recommends docker.io iptables mmdebstrap
+apt-get install --yes --no-install-recommends docker.io iptables mmdebstrap rclone
 if docker compose version >/dev/null 2>&1 && docker buildx version >/dev/null 2>&1; then
     exit 0
 fi

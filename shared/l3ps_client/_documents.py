@@ -58,6 +58,7 @@ class Drive(_File):
     format: str | None
     state: FileState
     problems: list[ErrorItem]
+    problem_count: NotRequired[int]
     info: dict[str, Any] | None
 
 
@@ -222,3 +223,4 @@ class LabelFiles(TypedDict):
     job_id: str
     format: str
     files: list[LabelFile]
+    next: NotRequired[str | None]

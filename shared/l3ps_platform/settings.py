@@ -6,7 +6,7 @@ The same code serves the embedded stack, one machine and a cluster; only the URL
 from __future__ import annotations
 
 from functools import lru_cache
-from ipaddress import IPv4Network, IPv6Network
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -74,7 +74,9 @@ class Settings(BaseSettings):
     port: int = 8080
     # The operator's. None: on loopback whoever reaches the service is the operator, elsewhere only API keys get in.
     token: SecretStr | None = None
-    trusted_proxies: str = ""  # addresses whose X-Forwarded-For is believed, comma-separated; empty: nobody's
+    # Addresses and networks whose X-Forwarded-For is believed, comma-separated; empty: nobody's. Behind a proxy that is
+    # not named here all clients share one address, and with it the limit of wrong credentials and the operator's rate.
+    trusted_proxies: str = ""
 
     # What one API key (or, without keys, one address) may ask: 200 clients that each ask once a second under one key
     # must pass, with room for what else they do.
@@ -124,7 +126,7 @@ class Settings(BaseSettings):
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
     # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
-    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    # after as long as it has waited already, at most after this, and fails when it has waited this long in all.
     outage_retry_seconds: float = 60.0
     outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0
@@ -177,6 +179,8 @@ class Settings(BaseSettings):
     webhook_timeout_seconds: float = Field(default=15.0, gt=0)  # for an attempt as a whole; the specification: 15 to 30
     webhook_disable_days: float = Field(default=5.0, gt=0)  # a webhook that took nothing for so long is switched off
 
+    # What Prometheus has to send as a bearer token. The metrics name projects and models; None: anybody may read them.
+    metrics_token: SecretStr | None = None
     metrics_jobs: int = 50  # quality series are kept for this many most recent jobs
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     log_format: Literal["json", "console"] = "json"
@@ -185,6 +189,23 @@ class Settings(BaseSettings):
     @classmethod
     def _listed(cls, value: object) -> object:
         return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+    @field_validator("metrics_token")
+    @classmethod
+    def _none_if_empty(cls, value: SecretStr | None) -> SecretStr | None:
+        return (
+            value if value is not None and value.get_secret_value() else None
+        )  # compose hands on what is not set as ""
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _addresses(cls, value: str) -> str:
+        for part in filter(None, (part.strip() for part in value.split(","))):
+            try:
+                ip_network(part)
+            except ValueError:  # the server would take it for a name that never matches, or `*` for everybody
+                raise ValueError("trusted proxies are addresses or networks, such as 10.0.0.7,172.18.0.0/16") from None
+        return value
 
     @field_validator("database_url")
     @classmethod

@@ -2,17 +2,21 @@
 
 The same scenes with one worker and with two, on PostgreSQL, MinIO and Redis of their own, each time in a fresh catalog
 and bucket. Workers are up and warm when the clock starts, and the drive has been checked. It runs from the job's
-creation to its end, so it holds everything between: messages, claims, commits, publication.
+creation to its end, so it holds everything between: messages, claims, commits, publication. Beside it the same scenes
+in bare processes (:mod:`bare`), and where the workers' time went.
 """
 
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import bare
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
@@ -23,8 +27,10 @@ from chaoslib import workload
 from chaoslib.servers import Minio, Postgres, Redis, wait_until
 from chaoslib.stack import Servers, Service
 from chaoslib.workload import Case, Workload
+from sqlalchemy import select
 
 from l3ps_platform.catalog import JobState
+from l3ps_platform.catalog.attempt_rows import AttemptRow
 
 GOAL = 0.55
 AS_SHIPPED = {
@@ -53,8 +59,8 @@ def network(path: Path, layers: int = 4, height: int = 192, width: int = 320) ->
     return workload.bundle(path, model.SerializeToString(), height, width)
 
 
-def measure(workers: int, folder: Path, servers: Servers, work: Workload) -> float:
-    """Seconds from the job's creation to its end."""
+def measure(workers: int, folder: Path, servers: Servers, work: Workload) -> dict[str, float]:
+    """Seconds from the job's creation to its end, and what its stages took of them."""
     servers.redis = Redis(folder / "redis")
     servers.redis.start()
     service = Service(folder, servers, work, lambda name, value: None, **AS_SHIPPED)
@@ -70,7 +76,15 @@ def measure(workers: int, folder: Path, servers: Servers, work: Workload) -> flo
         wait_until(lambda: service.job(job).state.final, "the job did not end", 600)
         row = service.job(job)
         assert row.state is JobState.SUCCEEDED, row.error
-        return (row.finished_at - row.created_at).total_seconds()
+        seconds = (row.finished_at - row.created_at).total_seconds()
+        with service.catalog.reading() as session:
+            attempts = session.scalars(select(AttemptRow).where(AttemptRow.job_id == job)).all()
+        return {
+            "seconds": seconds,
+            "stages' seconds": sum(attempt.seconds for attempt in attempts),
+            "stages' CPU seconds": sum(attempt.cpu_seconds for attempt in attempts),
+            "workers idle": 1 - sum(attempt.seconds for attempt in attempts) / seconds / workers,
+        }
     finally:
         service.close()
         servers.redis.stop()
@@ -97,17 +111,33 @@ def main() -> int:
         servers.postgres.start()
         servers.minio.start()
         try:
-            seconds = {
-                workers: min(measure(workers, folder / f"{workers}-{n}", servers, work) for n in range(given.rounds))
+            service = {
+                workers: min(
+                    (measure(workers, folder / f"{workers}-{n}", servers, work) for n in range(given.rounds)),
+                    key=lambda found: found["seconds"],
+                )
                 for workers in (1, 2)
             }
         finally:
             servers.minio.stop()
             servers.postgres.stop()
-    ratio = seconds[2] / seconds[1]
-    figures = {"scenes": given.scenes, "scans": given.scans, "one worker": seconds[1], "two workers": seconds[2]}
-    print(json.dumps(figures | {"ratio": round(ratio, 3), "goal": GOAL}))
+        alone = beside(folder, simulated, work.model, given.rounds)
+    figures: dict[str, Any] = {"scenes": given.scenes, "scans": given.scans, "service": service, "bare": alone}
+    ratio = service[2]["seconds"] / service[1]["seconds"]
+    figures |= {"ratio": round(ratio, 3), "bare ratio": round(alone[2] / alone[1], 3), "goal": GOAL}
+    print(json.dumps(figures, indent=1, default=str))
     return 0 if ratio <= GOAL else 1
+
+
+def beside(folder: Path, drive: bytes, model: bytes, rounds: int) -> dict[int, float]:
+    """Processes → seconds of the same scenes without a service."""
+    for name, content in {"drive": drive, "model": model}.items():
+        (folder / f"{name}.zip").write_bytes(content)
+        shutil.unpack_archive(folder / f"{name}.zip", folder / name)
+    return {
+        processes: min(bare.seconds(folder / "drive", folder / "model", CASE.preset, processes) for _ in range(rounds))
+        for processes in (1, 2)
+    }
 
 
 if __name__ == "__main__":

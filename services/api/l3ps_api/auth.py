@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Annotated
 from urllib.parse import parse_qsl
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Security
-from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -22,7 +22,10 @@ from l3ps_platform.settings import Settings
 from l3ps_platform.telemetry import bound
 
 PROJECT_HEADER = "L3PS-Project"
-_ADMIN = ("keys", "webhooks", "rules", "retention", "projects")
+_OPERATORS = "projects"
+_ADMIN = ("keys", "webhooks", "rules", "retention", _OPERATORS)
+_VERIFYING = 4
+"""Credentials looked up at once: a flood of wrong ones leaves the threads and connections of everybody else alone."""
 _READING = ("GET", "HEAD", "OPTIONS")
 _REMEDY = "Send `Authorization: Bearer SECRET`, an API key's or the operator's (the command line reads L3PS_TOKEN)."
 
@@ -38,14 +41,6 @@ async def authenticate(
 
 
 PrincipalDep = Annotated[Principal, Depends(authenticate)]
-
-
-def operator(principal: PrincipalDep) -> Principal:
-    """The caller, who must be the operator."""
-    if principal.key_id is not None:
-        what = f"projects are the operator's, and {principal.key_id} is an API key"
-        raise _forbidden(what, "Use the operator's token (L3PS_TOKEN).")
-    return principal
 
 
 def guarded(path: str) -> bool:
@@ -66,19 +61,23 @@ class Gate:
         self.app, self._keyring, self._operations = app, keyring, operations
         self._rates = Buckets(settings.rate_per_second, settings.rate_burst)
         self._failures = Buckets(settings.failures_per_second, settings.failures_burst)
+        self._verifying = CapacityLimiter(_VERIFYING)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not guarded(scope["path"]):
             await self.app(scope, receive, send)
             return
-        principal = await self._caller(scope)
+        needed = scope_needed(scope["method"], scope["path"])
+        principal = await self._caller(scope, fresh=needed == "admin" and scope["method"] not in _READING)
         wait = self._rates.take(principal.key_id or _address(scope))
         if wait:
             raise too_many(wait, "this key asks too often" if principal.key_id else "this address asks too often")
-        needed = scope_needed(scope["method"], scope["path"])
         if not principal.may(needed):
             what = f"this needs the scope {needed}, and {principal.key_id} has {principal.scope}"
             raise _forbidden(what, f"Use a key of scope {needed}.", needed)
+        if principal.key_id is not None and _collection(scope["path"]) == _OPERATORS:
+            what = f"projects are the operator's, and {principal.key_id} is an API key"
+            raise _forbidden(what, "Use the operator's token (L3PS_TOKEN).")
         operation = self._operations().at(scope["path"]).get(scope["method"])
         if operation is not None:
             _check_query(operation, scope["query_string"])
@@ -86,33 +85,36 @@ class Gate:
         with bound(project=principal.project_id, key=principal.key_id):
             await self.app(scope, receive, send)
 
-    async def _caller(self, scope: Scope) -> Principal:
+    async def _caller(self, scope: Scope, *, fresh: bool) -> Principal:
+        """Who asks. ``fresh``: by the catalog of now, so that no revoked key makes itself a successor elsewhere."""
         secret, project = _bearer_secret(scope), header(scope["headers"], b"l3ps-project") or ""
-        found = self._keyring.recall(secret, project)
+        found = None if fresh else self._keyring.recall(secret, project)
         if found is not None:
             return found
-        address = _address(scope)
-        if secret is not None and (wait := self._failures.wait(address)):
-            raise too_many(wait, "too many wrong credentials came from this address")
         try:
-            found = await run_in_threadpool(self._keyring.verify, secret, project)
+            found = await to_thread.run_sync(self._keyring.verify, secret, project, limiter=self._verifying)
         except NotFound as error:
             remedy = "GET /v1/projects lists those there are."
             raise invalid(PROJECT_HEADER, f"there is no project {error.id!r}", remedy) from error
         except PermissionError as error:
             raise _forbidden(f"the key {error} belongs to another project", f"Leave {PROJECT_HEADER} out.") from error
         if found is None:
-            if secret is not None:
-                self._failures.take(address)
+            # Right ones never come here: nobody is locked out by what others behind the same address get wrong.
+            if secret is not None and (wait := self._failures.take(_address(scope))):
+                raise too_many(wait, "too many wrong credentials came from this address")
             raise _unauthorized("the bearer token is missing" if secret is None else "the credentials are not valid")
         return found
 
 
 def scope_needed(method: str, path: str) -> KeyScope:
     """What a caller's scope must permit for a request."""
-    if path.split("/")[2] in _ADMIN:
+    if _collection(path) in _ADMIN:
         return "admin"
     return "read" if method in _READING else "write"
+
+
+def _collection(path: str) -> str:
+    return path.split("/")[2]
 
 
 def _bearer_secret(scope: Scope) -> bytes | None:

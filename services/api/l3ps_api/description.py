@@ -94,7 +94,7 @@ def _complete(path: str, method: str, operation: dict[str, Any]) -> None:
     elif path.startswith("/v1/objects/"):
         errors = {"403", "404", "409", "413", "422", "503"}
     else:
-        errors = {"503"} if path == "/readyz" else set()
+        errors = {"/readyz": {"503"}, "/metrics": {"401"}}.get(path, set())
     for status in sorted(errors):
         responses.setdefault(status, {"$ref": f"#/components/responses/Problem{status}"})
     responses["default"] = {"description": "Any other error.", "content": _CONTENT}

@@ -112,6 +112,8 @@ def _field_error(fault: dict[str, Any]) -> ErrorItem:
         return ErrorItem(where=where, what="there is no such field", remedy="Remove it or correct its name.")
     if kind == "malformed_cursor":
         return ErrorItem(where=where, what=what, remedy="Send `next` of the page before.")
+    if kind == "far_off_date":
+        return ErrorItem(where=where, what=what, remedy="Name a nearer one, as 2026-01-31T12:00:00Z.")
     return ErrorItem(where=where, what=what, remedy="/openapi.json says what this field takes.")
 
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 import asyncio
 import hashlib
 
+from anyio import from_thread
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from l3ps_api.auth import guarded
-from l3ps_api.problems import fault
-from l3ps_api.replies import Reply, ask, header, hold
+from l3ps_api.problems import fault, unavailable
+from l3ps_api.replies import Reply, again, ask, header, hold, read_body
+from l3ps_platform.catalog.conditions import only_if
 
 _CHANGING = ("PUT", "PATCH", "DELETE")
+_AT_ONCE = 8
+"""Changes with a condition: each takes a thread and a connection, and asks with others of them (there are 40, 15)."""
 
 
 class ETags:
@@ -22,7 +26,7 @@ class ETags:
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
-        self._one_at_a_time: asyncio.Lock | None = None
+        self._few = asyncio.Semaphore(_AT_ONCE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not guarded(scope["path"]):
@@ -30,11 +34,7 @@ class ETags:
         elif scope["method"] == "GET":
             await self._get(scope, receive, send)
         elif scope["method"] in _CHANGING and (wanted := header(scope["headers"], b"if-match")) is not None:
-            # One after the other, so that of two changes to the same document the second sees the first.
-            self._one_at_a_time = self._one_at_a_time or asyncio.Lock()
-            async with self._one_at_a_time:
-                await self._check(scope, wanted)
-                await self.app(scope, receive, send)
+            await self._change(scope, receive, send, wanted)
         else:
             await self.app(scope, receive, send)
 
@@ -48,15 +48,35 @@ class ETags:
             reply = Reply(304, [(name, value) for name, value in reply.headers if name in kept])
         await reply.send(send)
 
-    async def _check(self, scope: Scope, wanted: str) -> None:
+    async def _change(self, scope: Scope, receive: Receive, send: Send, wanted: str) -> None:
+        body = await read_body(receive)  # first: nobody waits for a client that takes its time
+        if body is None:
+            return
+        async with self._few:
+            refusal = await self._check(scope, wanted)
+            if refusal is not None:
+                await refusal.send(send)
+                return
+            with only_if(lambda: self._check_again(scope, wanted)):
+                await self.app(scope, again(body, receive), send)
+
+    def _check_again(self, scope: Scope, wanted: str) -> None:
+        if from_thread.run(self._check, scope, wanted) is not None:
+            raise unavailable("document")
+
+    async def _check(self, scope: Scope, wanted: str) -> Reply | None:
+        """Refuse a change to another document than the client has seen; the answer of a service that cannot tell."""
         present = await ask(self.app, scope, scope["path"])
+        if present.status >= 500:
+            return present
         if present.status != 200:
-            return  # the change itself says that there is nothing, or nothing to read
+            return None  # the change itself says that there is nothing, or nothing to read
         _tag(present)
         if not _names(wanted, present.header(b"etag"), weak=False):
             remedy = "GET it again, look at what changed, and send its new ETag."
             what = f"the document is not the one with the ETag {wanted[:100]}"
             raise fault(412, "changed", "The document has changed", "If-Match", what, remedy)
+        return None
 
 
 def _is_document(start: Message) -> bool:

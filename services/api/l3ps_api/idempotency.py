@@ -12,20 +12,23 @@ from dataclasses import replace
 import structlog
 from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from l3ps_api.keyring import SECRET, Principal
+from l3ps_api.limits import over_quota
 from l3ps_api.operations import Operations
 from l3ps_api.problems import ApiProblem, fault
-from l3ps_api.replies import Reply, ask, hold
+from l3ps_api.replies import Reply, again, ask, hold, read_body
 from l3ps_api.services import Services
 from l3ps_platform.catalog import requests
 from l3ps_platform.errors import CatalogUnavailable
 
 log = structlog.get_logger(__name__)
 
-KEEP_BYTES = 256 << 10
-"""An answer larger than this is not kept but made again from its resource: 10,000 part URLs are 5 MB."""
+KEEP_BYTES = 16 << 10
+"""An answer larger than this is not kept but made again, from its resource where it has one."""
+MOST_KEYS = 100_000
+"""Of a project at a time: with what is kept of each, 1.6 GB. More than one new key a second, all day."""
 
 _COLLECTIONS = {"api_keys": "keys"}
 """Where a table's rows are found under /v1, if not under its own name."""
@@ -33,6 +36,9 @@ _TRANSIENT = (b"content-length", b"date", b"server", b"connection", b"transfer-e
 _KEY = re.compile(r"[\x20-\x7e]{1,255}")
 _QUOTED_SECRET = re.compile(rb'"' + SECRET.pattern + rb'"')
 _PURGE_SECONDS = 60.0
+_NOT_KEPT = (401, 403, 429)
+_SHOWN_ONCE = {"api_keys"}
+"""Tables whose secret a repetition does not show again: the catalog does not have it."""
 
 Remade = Mapping[str, Callable[[Services, str], BaseModel]]
 """By table: makes the answer to the POST from the resource it made, where GET answers something else."""
@@ -42,7 +48,8 @@ class Idempotency:
     """Answers a repeated POST under /v1 as the first was answered, without doing it again.
 
     In one place for all routes: the effect is tied to the key by :mod:`l3ps_platform.catalog.requests`, in the commit
-    that makes it. Answers of the kind "try again" (429, 5xx) are not kept.
+    that makes it. Answers of the kind "try again" (429, 5xx) are not kept, nor what lets nobody in (401, 403). Secrets
+    and signed URLs are never kept: they are left out, or made again from their resource.
     """
 
     def __init__(self, app: ASGIApp, services: Services, operations: Callable[[], Operations], remade: Remade) -> None:
@@ -56,14 +63,19 @@ class Idempotency:
             await self.app(scope, receive, send)
             return
         key = _usable(given)
-        body = await _read(receive)
+        body = await read_body(receive)
         if body is None:
             return  # the client has gone in the middle of its request
         services = replace(self._services, catalog=self._services.catalog.scoped(principal.project_id))
         try:
-            state = await run_in_threadpool(self._begin, services, key, fingerprint(scope, body))
+            asked = fingerprint(principal, scope, body)
+            state = await run_in_threadpool(self._begin, services, key, asked)
         except requests.OtherRequest:
-            raise _refused(422, "idempotency-key-reused", "it was used for another request", "Use a new key.") from None
+            what = "it was used for another request, or by another caller"
+            raise _refused(422, "idempotency-key-reused", what, "Use a new key.") from None
+        except requests.TooMany:
+            remedy = "Each is kept for a day (L3PS_IDEMPOTENCY_SECONDS): send the same key with what is repeated alone."
+            raise over_quota("Idempotency-Key", MOST_KEYS, "keys", remedy) from None
         if isinstance(state, requests.Busy):
             after = max(1, math.ceil(min(state.seconds, 2)))
             what, remedy = "the first request with it is still in progress", f"Ask again in {after} s."
@@ -84,16 +96,16 @@ class Idempotency:
             with self._services.catalog.transaction() as tx:
                 requests.purge(tx)
         with services.catalog.transaction() as tx:
-            return requests.begin(tx, key, asked, **seconds)
+            return requests.begin(tx, key, asked, **seconds, most=MOST_KEYS)
 
     async def _kept(self, scope: Scope, services: Services, kept: requests.Kept) -> Reply:
         headers = [(name.encode("latin-1"), value.encode("latin-1")) for name, value in kept.headers.items()]
         body = kept.body
         if body is None and kept.made is not None:
-            again = await self._remake(scope, services, kept.made)
-            if again.status != 200:
-                return again
-            body = again.body
+            remade = await self._remake(scope, services, kept.made)
+            if remade.status != 200:
+                return remade
+            body = remade.body
         return Reply(kept.status, [*headers, (b"idempotent-replay", b"true")], body or b"")
 
     async def _done(
@@ -108,19 +120,23 @@ class Idempotency:
                 reply.headers = [(name, value) for name, value in reply.headers if name == b"content-type"]
                 reply.headers.append((b"location", _place(held.made).encode()))
         else:
-            kinds = self._operations().kinds
-            tables = kinds | {table for table, folder in _COLLECTIONS.items() if folder in kinds}
-            named = scope["path"].removeprefix("/v1/")
-            only = next((table for table in tables if _COLLECTIONS.get(table, table) == named), None)
-            with requests.bound(replace(held, kinds=frozenset(tables), only=only)):
-                reply = await hold(self.app, scope, _again(body, receive), send) or Reply()
+            known = self._operations()
+            operation = known.at(scope["path"]).get("POST")
+            # What it makes can answer for it only where the answer is a resource; a notification's is a count.
+            kinds = known.kinds if operation is not None and operation.resource else frozenset[str]()
+            tables = {folder: folder for folder in kinds} | {
+                folder: table for table, folder in _COLLECTIONS.items() if folder in kinds
+            }
+            only = tables.get(scope["path"].removeprefix("/v1/"))
+            with requests.bound(replace(held, kinds=frozenset(tables.values()), only=only)):
+                reply = await hold(self.app, scope, again(body, receive), send) or Reply()
         await run_in_threadpool(self._record, services, held, reply)
         return reply
 
     def _record(self, services: Services, held: requests.Held, reply: Reply) -> None:
         try:
             with services.catalog.transaction() as tx:
-                if reply.status >= 500 or reply.status == 429:
+                if reply.status >= 500 or reply.status in _NOT_KEPT:
                     requests.release(tx, held)
                     return
                 headers = {
@@ -128,7 +144,11 @@ class Idempotency:
                     for name, value in reply.headers if name not in _TRANSIENT
                 }  # fmt: skip
                 body = _QUOTED_SECRET.sub(b"null", reply.body)  # shown once, and never kept
-                requests.finish(tx, held, reply.status, headers, body, limit=KEEP_BYTES)
+                private = "no-store" in (reply.header(b"cache-control") or "")
+                tables = frozenset(self._remade) - _SHOWN_ONCE
+                requests.finish(
+                    tx, held, reply.status, headers, body, limit=KEEP_BYTES, private=private, again=tables
+                )  # fmt: skip
         except CatalogUnavailable as error:
             log.warning("an answer could not be kept; its lease runs out", reason=str(error))
 
@@ -154,34 +174,12 @@ def _usable(given: list[bytes]) -> str:
     return key
 
 
-def fingerprint(scope: Scope, body: bytes) -> str:
-    """SHA-256 of what a request asks for: path, query and body."""
-    found = hashlib.sha256(scope.get("raw_path", scope["path"].encode()) + b"?" + scope["query_string"] + b"\n")
+def fingerprint(principal: Principal, scope: Scope, body: bytes) -> str:
+    """SHA-256 of who asks and what for: path, query and body."""
+    found = hashlib.sha256(f"{principal.key_id or 'the operator'}\n".encode())
+    found.update(scope.get("raw_path", scope["path"].encode()) + b"?" + scope["query_string"] + b"\n")
     found.update(body)
     return found.hexdigest()
-
-
-async def _read(receive: Receive) -> bytes | None:
-    blocks = []
-    while (message := await receive())["type"] == "http.request":
-        blocks.append(message.get("body", b""))
-        if not message.get("more_body"):
-            return b"".join(blocks)
-    return None
-
-
-def _again(body: bytes, receive: Receive) -> Receive:
-    """A stream of messages that begins with the body once more."""
-    given = False
-
-    async def replayed() -> Message:
-        nonlocal given
-        if given:
-            return await receive()
-        given = True
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    return replayed
 
 
 def _refused(

@@ -6,6 +6,7 @@ import hashlib
 import hmac
 import re
 import secrets
+import threading
 import time
 from dataclasses import dataclass
 from datetime import datetime
@@ -66,6 +67,7 @@ class Keyring:
         self._operator = digest(settings.token.get_secret_value()) if settings.token else None
         self._open = settings.token is None and settings.loopback
         self._remembered: dict[tuple[str, str], tuple[Principal, float]] = {}
+        self._lock, self._forgotten = threading.Lock(), 0
 
     def recall(self, secret: bytes | None, project: str) -> Principal | None:
         """The caller, if these credentials were right a moment ago. Costs no look into the catalog."""
@@ -83,20 +85,23 @@ class Keyring:
             NotFound: the operator names a project that does not exist.
             PermissionError: a key names a project other than its own.
         """
+        forgotten = self._forgotten
         found = self._verified(secret, project)
-        if found is not None:
-            if len(self._remembered) >= _REMEMBERED:
-                self._remembered.clear()
-            name = _NOBODY if secret is None else digest(secret)
-            self._remembered[name, project] = (found, time.monotonic() + self._seconds)
+        name = _NOBODY if secret is None else digest(secret)
+        with self._lock:
+            if found is not None and forgotten == self._forgotten:  # else it may have been read before a revocation
+                if len(self._remembered) >= _REMEMBERED:
+                    self._remembered.clear()
+                self._remembered[name, project] = (found, time.monotonic() + self._seconds)
         return found
 
     def forget(self, key_id: str | None = None) -> None:
         """No longer believe what is remembered of a key, or of any caller."""
-        kept = {} if key_id is None else {
-            name: found for name, found in self._remembered.items() if found[0].key_id != key_id
-        }  # fmt: skip
-        self._remembered = kept
+        with self._lock:
+            self._forgotten += 1
+            self._remembered = {} if key_id is None else {
+                name: found for name, found in self._remembered.items() if found[0].key_id != key_id
+            }  # fmt: skip
 
     def _verified(self, secret: bytes | None, project: str) -> Principal | None:
         if secret is None:

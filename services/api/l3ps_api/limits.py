@@ -29,10 +29,6 @@ class Buckets:
         self._clock, self._size = clock, size
         self._full_at: dict[str, float] = {}  # in the order of the last request
 
-    def wait(self, caller: str) -> float:
-        """Seconds until the caller may ask, 0 for now."""
-        return max(0.0, self._full_at.get(caller, 0.0) - self._slack - self._clock())
-
     def take(self, caller: str) -> float:
         """Count a request if the caller may ask now; the seconds to wait if not, 0 if so."""
         now = self._clock()

@@ -21,24 +21,29 @@ class Operation:
         status: of its success.
         query: names of its query parameters.
         repeated: those of them that may be given several times.
+        resource: whether its answer is a document with an id.
     """
 
     template: str
     status: int
     query: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
+    resource: bool = False
 
 
 class Operations:
     """All operations of an application; made once all routers are in it."""
 
     def __init__(self, app: FastAPI) -> None:
-        paths: dict[str, Any] = app.openapi()["paths"]
+        document = app.openapi()
+        paths: dict[str, Any] = document["paths"]
         self._found: list[tuple[re.Pattern[str], str, Operation]] = []
         for route in _api_routes(app.routes):
             for method in sorted(route.methods or ()):
-                described = paths.get(route.path_format, {}).get(method.lower(), {})
-                self._found.append((route.path_regex, method, _operation(route, described)))
+                # HEAD is what GET is without its body, and not in the document.
+                described = paths.get(route.path_format, {}).get("get" if method == "HEAD" else method.lower(), {})
+                operation = _operation(route, described, document["components"]["schemas"])
+                self._found.append((route.path_regex, method, operation))
         self.kinds = frozenset(
             match[1] for path, operations in paths.items()
             if "get" in operations and (match := re.fullmatch(r"/v1/([a-z_]+)/\{[a-z_]+\}", path))
@@ -71,11 +76,21 @@ def _api_routes(routes: Iterable[BaseRoute]) -> Iterator[APIRoute]:
             yield from _api_routes(router.routes)
 
 
-def _operation(route: APIRoute, described: dict[str, Any]) -> Operation:
+def _operation(route: APIRoute, described: dict[str, Any], schemas: dict[str, Any]) -> Operation:
     query = [parameter for parameter in described.get("parameters", ()) if parameter.get("in") == "query"]
+    status = route.status_code or 200
+    answer = described.get("responses", {}).get(str(status), {}).get("content", {}).get("application/json", {})
     return Operation(
         route.path_format,
-        route.status_code or 200,
+        status,
         frozenset(parameter["name"] for parameter in query),
         frozenset(parameter["name"] for parameter in query if "array" in str(parameter["schema"])),
+        _has_id(answer.get("schema", {}), schemas),
     )
+
+
+def _has_id(schema: dict[str, Any], schemas: dict[str, Any]) -> bool:
+    if "anyOf" in schema:
+        return all(_has_id(each, schemas) for each in schema["anyOf"])
+    found = schemas.get(schema.get("$ref", "").rpartition("/")[2], schema)
+    return "id" in found.get("properties", {})

@@ -1,4 +1,4 @@
-"""Responses held back until they are whole, and questions that the service asks itself."""
+"""Requests read and responses held back until they are whole, and questions that the service asks itself."""
 
 from __future__ import annotations
 
@@ -37,6 +37,30 @@ class Reply:
 def header(headers: Headers, name: bytes) -> str | None:
     """The first header of a name, in lower case."""
     return next((value.decode("latin-1") for given, value in headers if given == name), None)
+
+
+async def read_body(receive: Receive) -> bytes | None:
+    """The whole body of a request; None where the client has gone in the middle of it."""
+    blocks = []
+    while (message := await receive())["type"] == "http.request":
+        blocks.append(message.get("body", b""))
+        if not message.get("more_body"):
+            return b"".join(blocks)
+    return None
+
+
+def again(body: bytes, receive: Receive) -> Receive:
+    """A stream of messages that begins with a body that has been read."""
+    given = False
+
+    async def replayed() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return replayed
 
 
 async def hold(

@@ -124,7 +124,8 @@ def delete(tx: Transaction, id: str) -> ModelRow:
     return row
 
 
-def leftover_archives(session: Session, limit: int = 100) -> list[ModelRow]:
-    """Rejected and deleted models whose archive is still in the store."""
+def leftover_archives(session: Session, limit: int = 100, after: str = "") -> list[ModelRow]:
+    """Rejected and deleted models whose archive is still in the store, after the id ``after``."""
     gone = or_(ModelRow.state == ModelState.REJECTED, ModelRow.deleted_at.is_not(None))
-    return list(session.scalars(select(ModelRow).where(gone, ModelRow.object_key.is_not(None)).limit(limit)))
+    query = select(ModelRow).where(gone, ModelRow.object_key.is_not(None), ModelRow.id > after)
+    return list(session.scalars(query.order_by(ModelRow.id).limit(limit)))

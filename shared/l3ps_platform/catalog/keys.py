@@ -9,7 +9,8 @@ from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
 from l3ps_platform.catalog.access_rows import ApiKeyRow
-from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.models import ProjectRow
+from l3ps_platform.catalog.session import Transaction, project_of
 from l3ps_platform.errors import Conflict
 
 
@@ -26,8 +27,31 @@ def add(
 
 
 def find(session: Session, id: str) -> ApiKeyRow | None:
-    """One key, or None."""
-    return session.scalars(select(ApiKeyRow).where(ApiKeyRow.id == id)).one_or_none()
+    """One key of a project that is there, or None."""
+    there = select(ProjectRow.id).where(ProjectRow.id == ApiKeyRow.project_id, ProjectRow.deleted_at.is_(None)).exists()
+    return session.scalars(select(ApiKeyRow).where(ApiKeyRow.id == id, there)).one_or_none()
+
+
+def hold_maker(tx: Transaction, maker: str | None, changed: str | None = None) -> None:
+    """See that the project and the key that makes a secret have not ended, and do not before the commit.
+
+    Args:
+        tx: a transaction of a scoped catalog.
+        maker: id of the key that asks; None for the operator.
+        changed: id of the key that is changed, to be locked with it: two that change each other wait in one order.
+
+    Raises:
+        Conflict: one of them has ended.
+    """
+    mine = project_of(tx.session)
+    there = select(ProjectRow).where(ProjectRow.id == mine, ProjectRow.deleted_at.is_(None))
+    project = tx.session.scalars(there.with_for_update(read=True)).one_or_none()
+    wanted = [id for id in (maker, changed) if id is not None]
+    query = select(ApiKeyRow).where(ApiKeyRow.id.in_(wanted)).order_by(ApiKeyRow.id).with_for_update()
+    rows = {row.id: row for row in tx.session.scalars(query, execution_options={"populate_existing": True})}
+    ended = maker is not None and (maker not in rows or _ended(rows[maker], tx.now))
+    if project is None or ended:
+        raise Conflict("the project, or the key that asks, has ended meanwhile: ask with credentials that are good")
 
 
 def get(session: Session, id: str) -> ApiKeyRow:
@@ -51,7 +75,7 @@ def revoke(tx: Transaction, id: str) -> ApiKeyRow:
 def rotate(tx: Transaction, id: str, secret_sha256: str, overlap_seconds: float) -> ApiKeyRow:
     """Give a key a new secret; the one before stays good for ``overlap_seconds``. NotFound, Conflict when revoked."""
     row = queries.lock(tx.session, ApiKeyRow, id)
-    if row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= tx.now):
+    if _ended(row, tx.now):
         raise Conflict(f"key {id} has ended: make a new one with POST /v1/keys")
     row.previous_sha256 = row.secret_sha256 if overlap_seconds > 0 else None
     row.previous_until = tx.now + timedelta(seconds=overlap_seconds) if overlap_seconds > 0 else None
@@ -79,3 +103,7 @@ def note_use(tx: Transaction, id: str, seconds: float = 60.0) -> None:
     long_ago = tx.now - timedelta(seconds=seconds)
     stale = or_(ApiKeyRow.last_used_at.is_(None), ApiKeyRow.last_used_at < long_ago)
     tx.session.execute(update(ApiKeyRow).where(ApiKeyRow.id == id, stale).values(last_used_at=tx.now))
+
+
+def _ended(row: ApiKeyRow, now: datetime) -> bool:
+    return row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= now)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import delete, event, func, select, update
+from sqlalchemy import delete, event, func, select, tuple_, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
@@ -64,12 +64,16 @@ class Busy:
     seconds: float
 
 
+class TooMany(Exception):  # noqa: N818
+    """The project has as many keys as it may."""
+
+
 class OtherRequest(Exception):  # noqa: N818
     """The key was used for a different request."""
 
 
 def begin(
-    tx: Transaction, key: str, fingerprint: str, *, lease_seconds: float, keep_seconds: float
+    tx: Transaction, key: str, fingerprint: str, *, lease_seconds: float, keep_seconds: float, most: int
 ) -> Held | Kept | Busy:
     """Take a key of the transaction's project, or learn what became of it.
 
@@ -79,14 +83,18 @@ def begin(
         fingerprint: SHA-256 of what the client asked for.
         lease_seconds: how long others wait for this request before they take it for dead.
         keep_seconds: life of the key.
+        most: keys that a project may have at a time.
 
     Raises:
         OtherRequest: the key belongs to a different request.
+        TooMany: the key is new, and the project has ``most`` already.
     """
     owner, project = secrets.token_hex(16), project_of(tx.session)
     lease_until = tx.now + timedelta(seconds=lease_seconds)
     row = _lock(tx.session, key)
     if row is None:
+        if _alive(tx.session, project, most) >= most:
+            raise TooMany(project)
         fresh = RequestRow(key=key, **_blank(fingerprint, owner, lease_until, tx.now, keep_seconds))
         try:
             with tx.session.begin_nested():
@@ -113,16 +121,30 @@ def begin(
     return Held(project, key, owner, made)
 
 
-def finish(tx: Transaction, held: Held, status: int, headers: dict[str, str], body: bytes, *, limit: int) -> None:
-    """Keep the answer, without a body of more than ``limit`` bytes if the resource that it was made from is noted.
+def finish(
+    tx: Transaction, held: Held, status: int, headers: dict[str, str], body: bytes, *,
+    limit: int, private: bool = False, again: frozenset[str] = frozenset(),
+) -> None:  # fmt: skip
+    """Keep the answer. Does nothing where the key has passed to another request.
 
-    Does nothing where the key has passed to another request.
+    Args:
+        tx: a transaction of a scoped catalog.
+        held: the key.
+        status, headers, body: of the answer.
+        limit: bytes of the largest body that is kept. A larger one is made again from the resource that is noted; where
+            none is, the request changed nothing, and the key is given back: a repetition does it again.
+        private: the body holds what must lie nowhere, such as signed URLs: kept only where it is that of a resource.
+        again: tables whose resources answer a repetition, so that no body is kept.
     """
     row = _lock(tx.session, held.key)
-    if row is not None and row.owner == held.owner and row.status is None:
-        row.status, row.headers = status, headers
-        row.body = None if row.result_id is not None and len(body) > limit else body
-        tx.session.flush()
+    if row is None or row.owner != held.owner or row.status is not None:
+        return
+    if row.result_id is None and (private or len(body) > limit):
+        tx.session.delete(row)
+    else:
+        remade = row.result_id is not None and (row.result_kind in again or len(body) > limit)
+        row.status, row.headers, row.body = status, headers, None if remade else body
+    tx.session.flush()
 
 
 def release(tx: Transaction, held: Held) -> None:
@@ -133,10 +155,12 @@ def release(tx: Transaction, held: Held) -> None:
     _change(tx.session, held, lease_until=tx.now)
 
 
-def purge(tx: Transaction) -> int:
-    """Forget the keys whose time is over; returns how many."""
-    old = delete(RequestRow).where(RequestRow.expires_at <= tx.now)
-    return _count(tx.session.execute(old, execution_options={"synchronize_session": False}))
+def purge(tx: Transaction, most: int = 5000) -> int:
+    """Forget keys whose time is over, ``most`` at once: somebody's request waits for it. Returns how many."""
+    row = RequestRow
+    old = select(row.project_id, row.key).where(row.expires_at <= tx.now).limit(most)
+    gone = delete(row).where(tuple_(row.project_id, row.key).in_(old))
+    return _count(tx.session.execute(gone, execution_options={"synchronize_session": False}))
 
 
 @contextmanager
@@ -189,6 +213,12 @@ def _note_result(session: Session) -> None:
         }
     if not _change(session, held, **values):
         raise Conflict("this request took so long that another one with its Idempotency-Key took over: repeat it")
+
+
+def _alive(session: Session, project: str, most: int) -> int:
+    """How many keys a project has, counted to ``most``: 100,000 take SQLite 7 ms, what is usual much less."""
+    found = select(RequestRow.key).where(RequestRow.project_id == project).limit(most).subquery()
+    return session.scalars(select(func.count()).select_from(found)).one()
 
 
 def _lock(session: Session, key: str) -> RequestRow | None:

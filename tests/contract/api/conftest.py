@@ -14,9 +14,11 @@ import httpx
 import numpy as np
 import psycopg
 import pytest
+from fastapi.testclient import TestClient
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
+from l3ps_api.app import create_app
 from l3ps_cli.main import app
 from l3ps_cli.packing import pack_bundle, pack_log
 from l3ps_cli.processes import Processes
@@ -205,6 +207,16 @@ def _looked_into(settings: Settings) -> Iterator[Service]:
     catalog.dispose()
 
 
+@pytest.fixture
+def replica(service) -> Iterator[TestClient]:
+    """Another API process' app on the same catalog, which believes for long what it has read about a key."""
+    api = create_app(service.settings.model_copy(update={"key_cache_seconds": 3600.0}))
+    credentials = {"Authorization": f"Bearer {service.token}"}
+    yield TestClient(api, base_url="http://127.0.0.1", headers=credentials)
+    api.state.services.catalog.dispose()
+    api.state.services.queue.close()
+
+
 @pytest.fixture(scope="session")
 def command(service):
     """Runs a command of the CLI against the service; returns (exit code, standard output, standard error)."""
@@ -314,7 +326,7 @@ class Played:
         """Claim the next stage that waits for a worker."""
         with self.catalog.transaction() as tx:
             stage = next(row for row in stages.of_job(tx.session, self.id) if row.state is StageState.QUEUED)
-            claim = workflow.claim(tx, stage.id, stage.attempt, "test", lease_seconds=600, max_attempts=3)
+            claim = workflow.claim(tx, stage.id, stage.attempt, "test", lease_seconds=600)
         assert claim is not None
         return claim
 

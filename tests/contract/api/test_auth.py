@@ -2,6 +2,10 @@
 
 import httpx
 import pytest
+from fastapi.testclient import TestClient
+from pydantic import SecretStr
+
+from l3ps_api.app import create_app
 
 TOKEN = "a-long-enough-token"
 
@@ -32,6 +36,16 @@ def test_health_and_metrics_need_no_token(guarded):
     assert httpx.get(f"{guarded}/healthz").is_success
     assert httpx.get(f"{guarded}/readyz").is_success
     assert httpx.get(f"{guarded}/metrics").is_success
+
+
+def test_metrics_want_their_own_token_where_they_have_one(service):
+    api = create_app(service.settings.model_copy(update={"metrics_token": SecretStr("scraper")}))
+    http = TestClient(api, base_url="http://127.0.0.1")
+    for header in ({}, {"authorization": "Bearer scrape"}, {"authorization": f"Bearer {service.token}"}):
+        refused = service.refused(http.get("/metrics", headers=header), 401, "unauthorized")
+        assert "L3PS_METRICS_TOKEN" in refused["errors"][0]["remedy"]
+    assert "l3ps_jobs" in http.get("/metrics", headers={"authorization": "Bearer scraper"}).text
+    assert http.get("/readyz").status_code != 401, "probes have none"
 
 
 def test_presigned_urls_carry_their_own_permission(guarded):

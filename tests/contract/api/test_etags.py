@@ -1,8 +1,15 @@
 """ETags: no byte twice, and no change to a document that one has not seen."""
 
 import secrets
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
+
+from l3ps_platform.catalog import Catalog
+from l3ps_platform.objects import open_store
 
 
 @pytest.fixture
@@ -14,6 +21,13 @@ def upload(service) -> str:
 def key(service) -> str:
     made = service.http.post("/v1/keys", json={"name": secrets.token_hex(4), "scope": "read"})
     return made.headers["location"]
+
+
+@pytest.fixture
+def webhook(service) -> Iterator[str]:
+    path = service.http.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/"}).headers["location"]
+    yield path
+    service.http.delete(path)
 
 
 def test_what_the_client_has_is_not_sent_again(service, upload):
@@ -67,3 +81,54 @@ def test_a_weak_etag_is_not_enough_for_a_change_and_a_star_is(service, key):
 
 def test_what_does_not_exist_is_said_before_any_etag(service):
     service.refused(service.http.delete("/v1/drives/none", headers={"If-Match": '"x"'}), 404, "unknown-drive")
+
+
+def test_a_change_whose_body_dribbles_holds_nobody_up(service, webhook):
+    begun, enough = threading.Event(), threading.Event()
+
+    def body():
+        yield b'{"descrip'
+        begun.set()
+        enough.wait()
+        yield b'tion": "slow"}'
+
+    headers = {"If-Match": "*", "Content-Type": "application/json"}
+    with ThreadPoolExecutor(1) as pool:
+        slow = pool.submit(service.http.patch, webhook, content=body(), headers=headers)
+        begun.wait()
+        try:
+            assert service.http.patch(webhook, json={"description": "quick"}, headers=headers).is_success
+        finally:
+            enough.set()
+        assert slow.result().json()["description"] == "slow"
+
+
+def test_of_two_changes_to_what_both_have_seen_one_is_made_also_in_two_processes(service, webhook, replica):
+    """The other process changes the document between this one's first look at it and its change."""
+    seen = service.http.get(webhook).headers["etag"]
+    others = []
+
+    class Overtaken(Catalog):
+        def transaction(self):
+            if not others:
+                others.append(service.http.patch(webhook, json={"description": "theirs"}, headers={"If-Match": seen}))
+            return super().transaction()
+
+    replica.app.state.services = replace(replica.app.state.services, catalog=Overtaken(service.settings.catalog_url))
+    answer = replica.patch(webhook, json={"description": "mine"}, headers={"If-Match": seen})
+    assert others[0].is_success
+    service.refused(answer, 412, "changed")
+    now = replica.get(webhook)
+    assert now.json()["description"] == "theirs"
+    answer = replica.patch(webhook, json={"description": "mine"}, headers={"If-Match": now.headers["etag"]})
+    assert answer.json()["description"] == "mine"
+    replica.app.state.services.catalog.dispose()
+
+
+def test_what_cannot_be_looked_at_is_not_changed(service, upload, replica):
+    """While the store is away nobody can say whether an upload is still as its client has seen it."""
+    system = replica.app.state.services
+    away = open_store(service.settings.model_copy(update={"objects_url": "s3://k:s@127.0.0.1:1/b?secure=0"}))
+    replica.app.state.services = replace(system, store=away)
+    service.refused(replica.delete(upload, headers={"If-Match": '"anything"'}), 503, "object-store-unavailable")
+    assert service.http.get(upload).json()["state"] == "open"

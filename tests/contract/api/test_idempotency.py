@@ -9,7 +9,8 @@ import httpx
 import pytest
 from sqlalchemy import select
 
-from l3ps_api.idempotency import fingerprint
+from l3ps_api.idempotency import MOST_KEYS, fingerprint
+from l3ps_api.keyring import Principal
 from l3ps_platform.catalog import DEFAULT_PROJECT, RequestRow, UploadRow, keys, projects, requests, uploads
 from l3ps_platform.ids import new_id
 
@@ -36,18 +37,29 @@ def made(service, upload) -> list[UploadRow]:
 def begun(service, path: str, body: dict, key: dict, lease_seconds: float) -> requests.Held:
     """What an API process does when it takes up this request."""
     content = httpx.Request("POST", "http://x", json=body).content
-    asked = fingerprint({"raw_path": path.encode(), "path": path, "query_string": b""}, content)
+    operator = Principal(DEFAULT_PROJECT, "admin")
+    asked = fingerprint(operator, {"raw_path": path.encode(), "path": path, "query_string": b""}, content)
     with service.catalog.transaction() as tx:
         held = requests.begin(
-            tx, key["Idempotency-Key"], asked, lease_seconds=lease_seconds, keep_seconds=3600.0
+            tx, key["Idempotency-Key"], asked, lease_seconds=lease_seconds, keep_seconds=3600.0, most=MOST_KEYS
         )  # fmt: skip
     return replace(held, kinds=frozenset({"uploads", "api_keys"}))
+
+
+def kept(service, key: dict) -> RequestRow | None:
+    """What the catalog holds of a request."""
+    with service.catalog.reading() as session:
+        return session.get(RequestRow, (DEFAULT_PROJECT, key["Idempotency-Key"]))
+
+
+def without_urls(upload: dict) -> dict:
+    return upload | {"parts": [part | {"url": None} for part in upload["parts"]]}
 
 
 def test_the_same_request_again_is_answered_alike_and_not_done_again(service, key, upload):
     first, again = (post(service, "/v1/uploads", upload, key) for _ in range(2))
     assert first.status_code == again.status_code == 201
-    assert first.content == again.content
+    assert without_urls(first.json()) == without_urls(again.json())
     assert first.headers["location"] == again.headers["location"]
     assert again.headers["idempotent-replay"] == "true"
     assert "idempotent-replay" not in first.headers
@@ -116,7 +128,7 @@ def test_an_upload_whose_process_died_after_its_commit_is_answered_with_that_upl
     assert httpx.put(answer.json()["parts"][0]["url"], content=b"123456789").is_success
     assert len(made(service, upload)) == 1
     again = post(service, "/v1/uploads", upload, key)
-    assert again.content == answer.content and again.headers["idempotent-replay"] == "true"
+    assert without_urls(again.json()) == without_urls(answer.json()) and again.headers["idempotent-replay"] == "true"
 
 
 def test_any_other_resource_is_answered_as_it_is_now(service, key):
@@ -147,9 +159,43 @@ def test_a_secret_is_shown_once_and_not_kept_with_the_answer(service, key):
     secret = first.json()["secret"]
     assert secret
     assert again.json() == first.json() | {"secret": None}
-    with service.catalog.reading() as session:
-        row = session.get(RequestRow, (DEFAULT_PROJECT, key["Idempotency-Key"]))
-        assert secret.encode() not in row.body and json.loads(row.body)["id"] == first.json()["id"]
+    body = kept(service, key).body
+    assert secret.encode() not in body and json.loads(body)["id"] == first.json()["id"]
+
+
+def test_the_secret_of_a_webhook_is_shown_again_and_not_kept_with_the_answer(service, key):
+    first, again = (post(service, "/v1/webhooks", {"url": "http://127.0.0.1:9/"}, key) for _ in range(2))
+    assert first.status_code == 201 and first.json()["secret"].startswith("whsec_")
+    assert again.json() == first.json() and again.headers["idempotent-replay"] == "true"
+    assert kept(service, key).body is None
+    service.http.delete(first.headers["location"])
+
+
+def test_signed_urls_are_made_anew_and_never_kept(service, key, upload):
+    opened = post(service, "/v1/uploads", upload, key)
+    assert kept(service, key).body is None
+    put = httpx.put(post(service, "/v1/uploads", upload, key).json()["parts"][0]["url"], content=b"123456789")
+    assert put.is_success, put.text
+    fresh = {"Idempotency-Key": secrets.token_hex(16)}
+    for _ in range(2):
+        parts = post(service, f"{opened.headers['location']}/parts", {"numbers": [1]}, fresh)
+        assert parts.status_code == 200 and parts.json()["parts"][0]["url"]
+        assert kept(service, fresh) is None, "it changed nothing: asked again, it is done again"
+
+
+def test_another_caller_is_not_answered_what_the_first_was(service, key):
+    """Else an API key would be told what the operator was, or the operator that an API key may not."""
+    secret = service.http.post("/v1/keys", json={"name": "x", "scope": "admin"}).json()["secret"]
+    theirs = key | {"Authorization": f"Bearer {secret}"}
+    body = {"name": secrets.token_hex(8)}
+    service.refused(post(service, "/v1/projects", body, theirs), 403, "forbidden")
+    assert post(service, "/v1/projects", body, key).status_code == 201
+    service.refused(post(service, "/v1/projects", body, theirs), 403, "forbidden")
+    upload = {"kind": "drive", "filename": "a.tar", "size": 9}
+    shared = {"Idempotency-Key": secrets.token_hex(16)}
+    assert post(service, "/v1/uploads", upload, shared).status_code == 201
+    answer = post(service, "/v1/uploads", upload, theirs | shared)
+    assert "caller" in service.refused(answer, 422, "idempotency-key-reused")["errors"][0]["what"]
 
 
 def test_a_refusal_is_an_answer_too(service, key):

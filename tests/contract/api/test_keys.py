@@ -6,8 +6,9 @@ from datetime import UTC, datetime, timedelta
 import httpx
 import pytest
 
-from l3ps_api.keyring import digest, new_secret
+from l3ps_api.keyring import Keyring, digest, new_secret
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, keys
+from l3ps_platform.errors import Conflict
 from l3ps_platform.ids import new_id
 
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
@@ -110,6 +111,16 @@ def test_a_key_can_be_given_an_end_but_not_in_the_past(service):
     assert service.refused(answer, 422, "invalid-request")["errors"][0]["where"] == "expires_at"
 
 
+@pytest.mark.parametrize("date", ["9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+14:00", "9000-01-01T00:00:01Z"])
+def test_a_date_at_the_edge_of_the_calendar_is_refused(service, date):
+    """In another zone it would be outside."""
+    answers = [service.http.post("/v1/keys", json={"name": "x", "scope": "read", "expires_at": date})]
+    answers += [service.http.post("/v1/webhooks/whk_none/replay", json={"since": date})]
+    for answer, field in zip(answers, ("expires_at", "since"), strict=True):
+        error = service.refused(answer, 422, "invalid-request")["errors"][0]
+        assert error["where"] == field and "1970 and 9000" in error["what"]
+
+
 def test_secrets_in_the_query_open_nothing(service):
     secret = made(service)["secret"]
     for name in ("token", "access_token", "key"):
@@ -171,6 +182,60 @@ def test_a_project_is_deleted_when_it_is_empty_and_its_keys_end(service):
     service.refused(service.http.get("/v1/me", headers=there), 422, "invalid-request")
     assert service.http.post("/v1/projects", json={"name": name}).status_code == 201, "the name is free again"
     service.refused(service.http.delete(f"/v1/projects/{DEFAULT_PROJECT}"), 409, "conflict")
+
+
+def test_a_key_revoked_elsewhere_makes_no_successor(service, replica):
+    key = made(service, "admin")
+    replica.headers["Authorization"] = f"Bearer {key['secret']}"
+    assert replica.get("/v1/me").is_success
+    assert service.http.delete(f"/v1/keys/{key['id']}").status_code == 204
+    assert replica.get("/v1/me").is_success, "what it reads it may for a moment"
+    body = {"name": "successor", "scope": "admin"}
+    service.refused(replica.post("/v1/keys", json=body), 401, "unauthorized")
+    other = made(service)["id"]
+    service.refused(replica.post(f"/v1/keys/{other}/rotate"), 401, "unauthorized")
+
+
+def test_a_key_that_ends_while_it_makes_another_makes_none(service):
+    with service.catalog.transaction() as tx:
+        ended = keys.add(tx, id=new_id("key"), name="x", scope="admin", secret_sha256="0" * 64, expires_at=None).id
+        keys.hold_maker(tx, ended)
+        keys.revoke(tx, ended)
+    with service.catalog.transaction() as tx, pytest.raises(Conflict, match="ended meanwhile"):
+        keys.hold_maker(tx, ended)
+
+
+def test_no_key_of_a_deleted_project_opens_anything(service, replica):
+    project = service.http.post("/v1/projects", json={"name": secrets.token_hex(8)}).json()["id"]
+    there = {"L3PS-Project": project}
+    key = service.http.post("/v1/keys", json={"name": "x", "scope": "admin"}, headers=there).json()
+    replica.headers["Authorization"] = f"Bearer {key['secret']}"
+    assert replica.get("/v1/me").is_success
+    assert service.http.delete(f"/v1/projects/{project}").status_code == 204
+    body = {"name": "successor", "scope": "admin"}
+    service.refused(replica.post("/v1/keys", json=body), 401, "unauthorized")
+    scoped = service.catalog.whole().scoped(project)
+    with scoped.transaction() as tx, pytest.raises(Conflict, match="ended meanwhile"):
+        keys.hold_maker(tx, None)
+    with scoped.transaction() as tx:
+        late = new_secret(new_id("key"))
+        id = late[len("l3ps_") :][:29]
+        keys.add(tx, id=id, name="late", scope="admin", secret_sha256=digest(late), expires_at=None)
+    service.refused(ask(service, late), 401, "unauthorized")
+
+
+def test_what_was_read_before_a_revocation_is_not_remembered_after_it(service):
+    key = made(service)
+
+    class Slow(Keyring):
+        def _verified(self, secret, project):
+            found = super()._verified(secret, project)
+            self.forget(key["id"])  # the revocation comes between reading and remembering
+            return found
+
+    keyring = Slow(service.settings, service.catalog.whole())
+    assert keyring.verify(key["secret"].encode(), "").key_id == key["id"]
+    assert keyring.recall(key["secret"].encode(), "") is None
 
 
 def test_use_is_noted_at_most_once_a_minute(service):

@@ -1,15 +1,20 @@
 """Who asks too much is told when to come back, and nobody else notices."""
 
 import secrets
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import httpx
 import pytest
+
+from l3ps_api.keyring import new_secret
+from l3ps_platform.ids import new_id
 
 TOKEN = secrets.token_urlsafe(32)
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
 
 
-BURST = 12
+BURST = 16
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +23,8 @@ def strict(api_process, redis_server) -> str:
     limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
     quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_open_upload_bytes": "1000", "max_active_jobs": "1"}
     redis_url = redis_server.removesuffix("/0") + "/4"
-    return api_process(token=TOKEN, redis_url=redis_url, training="1", **limits, **quotas)
+    others = {"event_streams": "4", "trusted_proxies": "127.0.0.1", "training": "1"}
+    return api_process(token=TOKEN, redis_url=redis_url, **limits, **quotas, **others)
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +93,51 @@ def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
         parts = {"parts": [{"number": 1, "etag": etag}]}
         annotations = http.post(f"/v1/uploads/{upload['id']}/complete", json=parts).json()["id"]
         request = {"annotations": annotations, "backbone": "scratch"}
-        assert http.post("/v1/models/train", json=request | {"name": "first"}).status_code == 202
+        first = http.post("/v1/models/train", json=request | {"name": "first"})
+        assert first.status_code == 202
         second = http.post("/v1/models/train", json=request | {"name": "second"})
         assert refused(second, "quota-reached")["errors"][0]["where"] == "jobs"
+        path = f"/v1/trainings/{first.json()['id']}"
+        assert http.post(f"{path}/cancel").json()["state"] == "cancelled"
+        assert http.post("/v1/models/train", json=request | {"name": "second"}).status_code == 202
+        refused(http.post(f"{path}/retry"), "quota-reached")
 
 
-def test_wrong_credentials_are_limited_by_address_and_right_ones_that_are_known_are_not(fresh, strict):
+def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_once(fresh, strict):
+    with fresh() as greedy, fresh() as modest, ExitStack() as streams:
+
+        def open_stream(http: httpx.Client) -> httpx.Response:
+            return streams.enter_context(http.stream("GET", "/v1/events"))
+
+        with ThreadPoolExecutor(BURST - 4) as pool:
+            answers = list(pool.map(open_stream, [greedy] * (BURST - 4)))
+        opened = [answer for answer in answers if answer.status_code == 200]
+        assert len(opened) == 2, "half of the four"
+        refusal = next(answer for answer in answers if answer.status_code != 200)
+        refusal.read()
+        refused(refusal, "too-many-streams")
+        assert open_stream(modest).status_code == 200
+        opened[0].close()
+        while "l3ps_event_streams 2.0" not in httpx.get(f"{strict}/metrics").text:
+            pass  # until the service has seen it
+        assert open_stream(greedy).status_code == 200
+
+
+def test_wrong_credentials_are_limited_by_address_and_right_ones_pass_all_the_same(fresh, strict):
+    """Also right ones that the process has not seen before: their holder may share an address with whoever guesses."""
+    guesses = [guess(strict, str(n)) for n in range(3)] + [guess(strict, new_secret(new_id("key"))) for _ in range(3)]
+    assert [answer.status_code for answer in guesses] == [401] * 3 + [429] * 3
+    refused(guesses[-1], "too-many-requests")
     with fresh() as http:
-        assert http.get("/v1/me").is_success
-        guesses = [httpx.get(f"{strict}/v1/me", headers={"Authorization": f"Bearer {n}"}) for n in range(6)]
-        assert [answer.status_code for answer in guesses] == [401] * 3 + [429] * 3
-        refused(guesses[-1], "too-many-requests")
-        assert http.get("/v1/me").is_success
+        assert [http.get("/v1/me").status_code for _ in range(3)] == [200] * 3
+    assert guess(strict, "one more").status_code == 429
+
+
+def test_behind_a_known_proxy_clients_are_told_apart_by_the_address_it_names(strict):
+    there, elsewhere = ({"X-Forwarded-For": address} for address in ("198.51.100.1", "198.51.100.2"))
+    assert [guess(strict, "x", there).status_code for _ in range(5)] == [401] * 3 + [429] * 2
+    assert guess(strict, "x", elsewhere).status_code == 401
+
+
+def guess(url: str, secret: str, headers: dict | None = None) -> httpx.Response:
+    return httpx.get(f"{url}/v1/me", headers={"Authorization": f"Bearer {secret}"} | (headers or {}))

@@ -59,6 +59,7 @@ def test_a_real_prometheus_scrapes_the_service_and_evaluates_it_all(service, obs
     config["rule_files"] = [str(RULES)]
     config["scrape_configs"] = config["scrape_configs"][:1]
     config["scrape_configs"][0]["static_configs"][0]["targets"] = [service.url.removeprefix("http://")]
+    (tmp_path / "metrics-token").touch()  # as compose has it where the service wants none
     (tmp_path / "prometheus.yml").write_text(yaml.safe_dump(config))
     url = f"http://127.0.0.1:{free_port()}"
     address = f"--web.listen-address={url.removeprefix('http://')}"

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Catalog, drives, requests
+from l3ps_platform.catalog import Catalog, drives, projects, requests
 from l3ps_platform.errors import Conflict
 
 pytestmark = pytest.mark.services
@@ -15,9 +15,9 @@ DEAD = {"lease_seconds": 0.0, "keep_seconds": 3600.0}
 KINDS = frozenset({"drives", "jobs"})
 
 
-def begin(catalog: Catalog, key: str = "k", fingerprint: str = "f", **seconds: float):
+def begin(catalog: Catalog, key: str = "k", fingerprint: str = "f", most: int = 100, **seconds: float):
     with catalog.transaction() as tx:
-        return requests.begin(tx, key, fingerprint, **(seconds or LONG))
+        return requests.begin(tx, key, fingerprint, **(seconds or LONG), most=most)
 
 
 def bound(held: requests.Held):
@@ -31,9 +31,9 @@ def make(catalog: Catalog) -> str:
         return workflow.accept_drive(tx, name="d", **FILE).id
 
 
-def finish(catalog: Catalog, held: requests.Held, body: bytes = b"{}", limit: int = 100) -> None:
+def finish(catalog: Catalog, held: requests.Held, body: bytes = b"{}", **how) -> None:
     with catalog.transaction() as tx:
-        requests.finish(tx, held, 201, {"location": "/x"}, body, limit=limit)
+        requests.finish(tx, held, 201, {"location": "/x"}, body, **({"limit": 100} | how))
 
 
 def test_of_many_at_once_one_does_the_work(catalog: Catalog) -> None:
@@ -138,8 +138,33 @@ def test_an_answer_too_large_to_keep_is_left_to_its_resource(catalog: Catalog) -
     finish(catalog, held, b"x" * 101)
     kept = begin(catalog)
     assert (kept.body, kept.made) == (None, ("drives", drive))
-    finish(catalog, begin(catalog, "made nothing"), b"x" * 101)
-    assert begin(catalog, "made nothing").body == b"x" * 101
+
+
+@pytest.mark.parametrize("answer", [{"body": b"x" * 101}, {"private": True}])
+def test_an_answer_without_a_resource_that_is_large_or_private_is_not_kept_and_done_again(catalog, answer) -> None:
+    finish(catalog, begin(catalog), **answer)
+    assert isinstance(begin(catalog), requests.Held)
+
+
+def test_an_answer_that_its_resource_gives_again_is_not_kept(catalog: Catalog) -> None:
+    held = begin(catalog)
+    with bound(held):
+        drive = make(catalog)
+    finish(catalog, held, private=True, again=frozenset({"drives"}))
+    kept = begin(catalog)
+    assert (kept.status, kept.body, kept.made) == (201, None, ("drives", drive))
+
+
+def test_a_project_has_so_many_keys_and_the_others_are_not_its_concern(catalog: Catalog) -> None:
+    with catalog.whole().transaction() as tx:
+        other = catalog.whole().scoped(projects.add(tx, "other").id)
+    for number in range(2):
+        assert isinstance(begin(catalog, str(number), most=2), requests.Held)
+    with pytest.raises(requests.TooMany):
+        begin(catalog, "a third", most=2)
+    finish(catalog, begin(catalog, "kept", most=3))
+    assert isinstance(begin(catalog, "kept", most=2), requests.Kept), "a repetition is no new key"
+    assert isinstance(begin(other, "first", most=2), requests.Held)
 
 
 def test_a_key_lives_for_its_time(catalog: Catalog) -> None:
@@ -147,9 +172,10 @@ def test_a_key_lives_for_its_time(catalog: Catalog) -> None:
     assert isinstance(begin(catalog, fingerprint="another"), requests.Held), "its time is over"
     with catalog.transaction() as tx:
         assert requests.purge(tx) == 0
-    begin(catalog, "old", lease_seconds=0.0, keep_seconds=0.0)
+    for key in ("old", "older", "oldest"):
+        begin(catalog, key, lease_seconds=0.0, keep_seconds=0.0)
     with catalog.transaction() as tx:
-        assert requests.purge(tx) == 1
+        assert [requests.purge(tx, most=2) for _ in range(3)] == [2, 1, 0]
 
 
 def test_work_without_a_key_notes_nothing(catalog: Catalog) -> None:

@@ -48,13 +48,6 @@ def test_callers_do_not_share_a_bucket_and_the_memory_of_them_is_bounded(clock):
     assert buckets.take("address 0") == 0
 
 
-def test_to_ask_how_long_to_wait_counts_as_nothing(clock):
-    buckets = Buckets(rate=1, burst=2, clock=clock)
-    assert [buckets.wait("a") for _ in range(9)] == [0] * 9
-    buckets.take("a"), buckets.take("a")
-    assert buckets.wait("a") == pytest.approx(1)
-
-
 def test_the_answer_says_when_to_come_back_in_whole_seconds():
     problem = too_many(0.01, "this key asks too often")
     assert problem.status == 429 and problem.headers == {"Retry-After": "1"}

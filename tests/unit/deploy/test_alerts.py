@@ -23,6 +23,7 @@ def test_promtool_runs_the_rules_through_their_scenarios(prometheus_tool: Callab
 def test_promtool_takes_the_configuration(prometheus_tool: Callable[[str], Path], tmp_path: Path) -> None:
     for name in ("prometheus.yml", "rules.yml"):
         shutil.copy(FOLDER / name, tmp_path)
+    (tmp_path / "metrics-token").touch()
     command = [prometheus_tool("promtool"), "check", "config", tmp_path / "prometheus.yml"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "rules found" in done.stdout, done.stdout + done.stderr

@@ -48,6 +48,9 @@ def test_s3_location() -> None:
         ("objects_url", "s3://host/bucket", "no credentials"),
         ("objects_url", "s3://k:s@host", "s3://KEY:SECRET@host:port/bucket"),
         ("objects_url", "s3://k:s@host/bucket/deeper", "s3://KEY:SECRET@host:port/bucket"),
+        ("trusted_proxies", "*", "addresses or networks"),
+        ("trusted_proxies", "10.0.0.7,proxy.example", "addresses or networks"),
+        ("trusted_proxies", "172.18.0.1/16", "addresses or networks"),
     ],
 )
 def test_wrong_places_are_refused_with_the_right_form(name: str, value: str, said: str) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
 
+from l3ps_api.auth import PrincipalDep
 from l3ps_api.keys import service
 from l3ps_api.keys.schemas import Key, KeyPage, KeyRequest, KeyWithSecret, Rotation
 from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
@@ -15,9 +16,11 @@ KeyCursor = Annotated[Cursor, id_of("key")]
 
 
 @router.post("", status_code=201)
-def create_key(request: KeyRequest, response: Response, services: ServicesDep) -> KeyWithSecret:
+def create_key(
+    request: KeyRequest, response: Response, services: ServicesDep, principal: PrincipalDep
+) -> KeyWithSecret:  # fmt: skip
     """Make a key. Its secret is in this answer and nowhere else."""
-    key = service.create(services, request)
+    key = service.create(services, request, principal.key_id)
     response.headers["Location"] = f"/v1/keys/{key.id}"
     response.headers["Cache-Control"] = "no-store"
     return key
@@ -44,10 +47,11 @@ def revoke_key(key_id: str, services: ServicesDep, http: Request) -> None:
 
 @router.post("/{key_id}/rotate")
 def rotate_key(
-    key_id: str, services: ServicesDep, http: Request, response: Response, rotation: Rotation | None = None
-) -> KeyWithSecret:
+    key_id: str, services: ServicesDep, principal: PrincipalDep, http: Request, response: Response,
+    rotation: Rotation | None = None,
+) -> KeyWithSecret:  # fmt: skip
     """Give a key a new secret. The old one ends at once, or after `overlap_seconds`."""
-    key = service.rotate(services, key_id, rotation.overlap_seconds if rotation is not None else 0)
+    key = service.rotate(services, key_id, principal.key_id, rotation.overlap_seconds if rotation else 0)
     http.app.state.keyring.forget(key_id)
     response.headers["Cache-Control"] = "no-store"
     return key

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from l3ps_api.keyring import Scope
+from l3ps_api.moments import Moment
 from l3ps_api.uploads.schemas import Name
 from l3ps_platform.catalog import ApiKeyRow
 
@@ -23,7 +24,7 @@ class KeyRequest(BaseModel):
         description="`read`: GET; `write`: uploads, drives, models, jobs and trainings too; `admin`: keys, webhooks, "
         "rules and retention too."
     )
-    expires_at: AwareDatetime | None = Field(default=None, description="When it ends; default: never.")
+    expires_at: Moment | None = Field(default=None, description="When it ends; default: never.")
 
 
 class Rotation(BaseModel):

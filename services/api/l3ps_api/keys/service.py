@@ -14,13 +14,14 @@ from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.ids import new_id
 
 
-def create(services: Services, request: KeyRequest) -> KeyWithSecret:
-    """A new key with its secret."""
+def create(services: Services, request: KeyRequest, maker: str | None) -> KeyWithSecret:
+    """A new key with its secret, made by the key ``maker`` or the operator. Conflict when that key has ended."""
     if request.expires_at is not None and request.expires_at <= datetime.now(UTC):
         raise invalid("expires_at", f"{request.expires_at.isoformat()} is past", "Name a time to come.")
     id = new_id("key")
     secret = new_secret(id)
     with services.catalog.transaction() as tx:
+        keys.hold_maker(tx, maker)
         row = keys.add(
             tx, id=id, name=request.name, scope=request.scope, secret_sha256=digest(secret),
             expires_at=request.expires_at,
@@ -48,10 +49,11 @@ def revoke(services: Services, key_id: str) -> None:
         keys.revoke(tx, key_id)
 
 
-def rotate(services: Services, key_id: str, overlap_seconds: int = 0) -> KeyWithSecret:
-    """Give a key a new secret. NotFound, Conflict when it has ended."""
+def rotate(services: Services, key_id: str, maker: str | None, overlap_seconds: int = 0) -> KeyWithSecret:
+    """Give a key a new secret. NotFound; Conflict when it, or the key ``maker`` that asks for it, has ended."""
     secret = new_secret(key_id)
     with services.catalog.transaction() as tx:
+        keys.hold_maker(tx, maker, changed=key_id)
         row = keys.rotate(tx, key_id, digest(secret), overlap_seconds)
         note_result(tx.session, "api_keys", key_id)
     return _shown(row, secret)

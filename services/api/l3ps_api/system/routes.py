@@ -1,13 +1,15 @@
-"""Health, readiness and metrics: asked by machines of the same network, so they need no token."""
+"""Health, readiness and metrics: asked by machines of the same network, so they need no credentials of the API."""
 
 from __future__ import annotations
 
+import hmac
+
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
-from l3ps_api.services import SystemDep
-from l3ps_api.system.checks import check_all
+from l3ps_api.problems import fault
+from l3ps_api.system.shared import Shared
 
 router = APIRouter(tags=["system"])
 
@@ -44,12 +46,29 @@ async def healthz() -> Health:
 
 
 @router.get("/readyz")
-def readyz(services: SystemDep) -> Readiness:
+async def readyz(request: Request) -> Readiness:
     """Whether catalog, object store and queue answer; 503 names those that do not."""
-    return Readiness(checks=check_all(services))
+    checks: Shared[dict[str, str]] = request.app.state.readiness
+    return Readiness(checks=await checks.get())
 
 
 @router.get("/metrics", response_class=Response)
-def metrics(request: Request) -> Response:
-    """Prometheus metrics, those of the service computed from the catalog at this moment."""
-    return Response(generate_latest(request.app.state.registry), media_type=CONTENT_TYPE_LATEST)
+async def metrics(request: Request) -> Response:
+    """Prometheus metrics, those of the service computed from the catalog at this moment.
+
+    With the bearer token L3PS_METRICS_TOKEN, where the service has one.
+    """
+    _admit(request)
+    page: Shared[bytes] = request.app.state.metrics
+    return Response(await page.get(), media_type=CONTENT_TYPE_LATEST)
+
+
+def _admit(request: Request) -> None:
+    wanted = request.app.state.services.settings.metrics_token
+    if wanted is None:
+        return
+    given = request.headers.get("authorization", "").encode("latin-1")
+    if not hmac.compare_digest(given, b"Bearer " + wanted.get_secret_value().encode()):
+        what, remedy = "the metrics are for those who have their token", "Send it: `Bearer` and L3PS_METRICS_TOKEN."
+        headers = {"WWW-Authenticate": "Bearer"}
+        raise fault(401, "unauthorized", "Unauthorized", "Authorization", what, remedy, headers)

@@ -31,6 +31,7 @@ def open_upload(request: UploadRequest, response: Response, services: ServicesDe
     """Announce a file; the answer holds a presigned URL for each part."""
     upload = service.open_upload(services, request)
     response.headers["Location"] = f"/v1/uploads/{upload.id}"
+    response.headers["Cache-Control"] = "no-store"  # its URLs let whoever has them write
     return upload
 
 
@@ -52,8 +53,9 @@ def get_upload(upload_id: str, services: ServicesDep) -> UploadProgress:
 
 
 @router.post("/{upload_id}/parts")
-def presign_parts(upload_id: str, wanted: PartsWanted, services: ServicesDep) -> PartUrls:
+def presign_parts(upload_id: str, wanted: PartsWanted, response: Response, services: ServicesDep) -> PartUrls:
     """Fresh URLs for parts of an open upload."""
+    response.headers["Cache-Control"] = "no-store"
     return service.urls(services, upload_id, wanted.numbers)
 
 

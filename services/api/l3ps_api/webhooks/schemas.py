@@ -5,8 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from l3ps_api.moments import Moment
 from l3ps_platform.catalog import DeliveryRow, DeliveryState, EventKind, WebhookRow
 from l3ps_platform.catalog.kinds import select_kinds
 
@@ -59,7 +60,7 @@ class Rotation(BaseModel):
 class ReplayRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    since: AwareDatetime = Field(description="Replay what failed of that which happened since then.")
+    since: Moment = Field(description="Replay what failed of that which happened since then.")
 
 
 class Replayed(BaseModel):
