@@ -176,6 +176,15 @@ class running:  # noqa: N801
             self.process.wait()
 
 
+def wait_until(look: Callable[[], Any], wanted: Callable[[Any], object] = bool, seconds: float = 90.0) -> Any:
+    """What ``look`` finds, once it is as wanted; fails with what it found last."""
+    deadline = time.monotonic() + seconds
+    while not wanted(found := look()):
+        assert time.monotonic() < deadline, f"not within {seconds:g} s, last seen: {found!r}"
+        time.sleep(0.05)
+    return found
+
+
 def free_port() -> int:
     """A TCP port nobody listens on."""
     with socket.socket() as probe:

@@ -14,30 +14,23 @@ from l3ps_client._client import Client
 from l3ps_client._documents import (
     FINAL,
     Annotations,
-    Delivery,
     Drive,
     ErrorItem,
     Job,
     JobState,
     JobSummary,
-    Key,
     LabelFile,
     LabelFiles,
     LabelFormat,
-    Me,
     Model,
     Page,
-    Project,
     Ref,
-    Retention,
-    Rule,
     Scene,
     Side,
     Stage,
     Training,
     TrainingSummary,
     Upload,
-    Webhook,
 )
 from l3ps_client._errors import (
     Conflict,
@@ -53,6 +46,7 @@ from l3ps_client._errors import (
     Unreachable,
     sentences,
 )
+from l3ps_client._project_documents import Delivery, Key, Me, Project, Retention, Rule, Webhook
 from l3ps_client._sending import Progress
 from l3ps_client._sse import Event
 from l3ps_client._wire import Retry

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from l3ps_client._documents import Key, Project, Retention
+from l3ps_client._project_documents import Key, Project, Retention
 from l3ps_client._resource import Group, items, path
 
 

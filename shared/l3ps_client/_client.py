@@ -10,12 +10,12 @@ import httpx
 
 from l3ps_client._access import Keys, Projects, RetentionRules
 from l3ps_client._config import Config, cache_folder
-from l3ps_client._documents import Me
 from l3ps_client._files import AnnotationSets, Drives, Models, Uploads
 from l3ps_client._hooks import Events, Rules, Webhooks
 from l3ps_client._jobs import Jobs, Trainings
 from l3ps_client._labels import Labels
 from l3ps_client._ledger import Ledger
+from l3ps_client._project_documents import Me
 from l3ps_client._wire import Retry, Wire, new_key
 
 DEFAULT_STATE = Path()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from l3ps_client._documents import Delivery, Rule, Webhook
+from l3ps_client._project_documents import Delivery, Rule, Webhook
 from l3ps_client._resource import Group, items, path
 from l3ps_client._sse import Event
 from l3ps_client._watching import follow

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 from contextlib import suppress
 
 import uvicorn
 
 from l3ps_api.app import create_app
-from l3ps_api.events.hub import EventHub
+from l3ps_api.server import HEAD_BYTES, Protocol, Server, most_connections
 from l3ps_platform.settings import get_settings
 from l3ps_platform.telemetry import configure_logging
-
-
-class Server(uvicorn.Server):
-    """Tells streams that the process stops: they have no other end, and the server waits for all answers to end."""
-
-    def __init__(self, config: uvicorn.Config, streams: EventHub) -> None:
-        super().__init__(config)
-        self._streams = streams
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop serving."""
-        self._streams.close()
-        await super().shutdown(sockets)
 
 
 def main() -> None:
@@ -43,6 +29,9 @@ def main() -> None:
         proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=settings.trusted_proxies or None,
         timeout_graceful_shutdown=3,
+        http=Protocol,
+        h11_max_incomplete_event_size=HEAD_BYTES,
+        limit_concurrency=most_connections(),  # 503 beyond it, instead of an accept that fails for everybody
     )
     server = Server(config, app.state.events)
     with suppress(KeyboardInterrupt):

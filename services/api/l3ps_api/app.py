@@ -8,14 +8,14 @@ from contextlib import asynccontextmanager
 from importlib.metadata import version
 
 import structlog
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Request
 from fastapi.concurrency import run_in_threadpool
 from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 
 from l3ps_api import errors
 from l3ps_api.access_log import AccessLog
 from l3ps_api.annotation_sets.routes import router as annotation_sets
-from l3ps_api.auth import Gate, authenticate
+from l3ps_api.auth import Gate, PrincipalDep, authenticate
 from l3ps_api.description import describe
 from l3ps_api.drives.routes import router as drives
 from l3ps_api.etags import ETags
@@ -27,13 +27,13 @@ from l3ps_api.keyring import Keyring
 from l3ps_api.keys import service as key_service
 from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
-from l3ps_api.middleware import BodyLimit, LoopbackHosts, RequestMetrics
+from l3ps_api.middleware import LoopbackHosts, RequestMetrics, SizeLimits
 from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
 from l3ps_api.patience import HangUp
-from l3ps_api.places import Places
+from l3ps_api.places import Places, Turns
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
@@ -59,6 +59,11 @@ from l3ps_platform.workflow import Reconciler, Sweeper
 
 log = structlog.get_logger(__name__)
 
+TURNS = 32
+"""Requests worked on at once, of the forty threads that there are: a store that hangs holds those of one project for
+half a minute, and 16 are not all."""
+WAITING = 1000
+"""Requests of a project that wait for a turn: the burst that a key may send is 2000."""
 ARCHIVES = 16
 """Archives sent at once: each holds a connection to the store, a manifest (45 MB for 68,000 files) and, while it waits
 for a block, one of the forty threads that answer requests."""
@@ -105,7 +110,8 @@ def create_app(settings: Settings) -> FastAPI:
     streams.set_function(lambda: app.state.events.places.taken)
     app.state.metrics = Shared(lambda: generate_latest(app.state.registry))
     app.state.readiness = Shared(lambda: check_all(services))
-    guarded = [Depends(authenticate)]
+    app.state.turns = Turns(TURNS, WAITING)
+    guarded = [Depends(authenticate), Depends(_turn, scope="function")]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
     resources = (uploads, drives, jobs, labels, models, annotation_sets, trainings, retention, rules, notifications)
@@ -122,7 +128,7 @@ def create_app(settings: Settings) -> FastAPI:
     )  # fmt: skip
     app.add_middleware(ETags)
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
-    app.add_middleware(BodyLimit, exempt="/v1/objects/")
+    app.add_middleware(SizeLimits, exempt="/v1/objects/")
     app.add_middleware(errors.Problems)
     if settings.loopback and not settings.public_url:
         app.add_middleware(LoopbackHosts)
@@ -133,6 +139,12 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(HangUp)
     describe(app)
     return app
+
+
+async def _turn(request: Request, principal: PrincipalDep) -> AsyncIterator[None]:
+    turns: Turns = request.app.state.turns
+    async with turns.turn(principal.project_id):
+        yield  # until there is an answer; sending it takes as long as the client does
 
 
 @asynccontextmanager

@@ -1,4 +1,4 @@
-"""What every request passes before it reaches a route: measurement, a guard of the host name, a limit of the body."""
+"""What every request passes before it reaches a route: measurement, a guard of the host name, a limit of size."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from l3ps_api.problems import answer, fault, too_large
 
 JSON_BODY_BYTES = 2 << 20
 """The largest JSON body taken: the completion of an upload of 10,000 parts is below 1 MB."""
+
+HEADER_BYTES = 16 << 10
+"""All headers of a request."""
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _LOOPBACK = {"127.0.0.1", "localhost", "[::1]"}
@@ -70,14 +73,28 @@ class LoopbackHosts:
         await self.app(scope, receive, send)
 
 
-class BodyLimit:
-    """Refuses JSON bodies that are too large, before they are read where their length is declared."""
+class SizeLimits:
+    """Refuses headers and JSON bodies that are too large, the latter before they are read where they tell their length.
+
+    ``exempt`` is the begin of paths whose bodies may be of any size.
+    """
 
     def __init__(self, app: ASGIApp, exempt: str) -> None:
         self.app, self.exempt = app, exempt
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"].startswith(self.exempt):
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        size = sum(len(name) + len(value) for name, value in scope["headers"])
+        if size > HEADER_BYTES:
+            what = f"the headers have {size} bytes, and {HEADER_BYTES} at most are read"
+            problem = fault(
+                431, "headers-too-large", "Headers too large", "headers", what, "Send fewer or shorter ones."
+            )
+            await answer(problem, scope["path"])(scope, receive, send)
+            return
+        if scope["path"].startswith(self.exempt):
             await self.app(scope, receive, send)
             return
         what = f"the body is larger than {JSON_BODY_BYTES} bytes"

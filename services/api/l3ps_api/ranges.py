@@ -35,14 +35,29 @@ class RangedResponse(PatientResponse):
         etag: strong: two bodies of one etag are the same to the byte; without quotes.
         media_type: Content-Type.
         headers: further headers.
+        close: called when the answer has ended, whatever it came to.
     """
 
-    def __init__(self, read: Read, size: int, etag: str, media_type: str, headers: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        read: Read,
+        size: int,
+        etag: str,
+        media_type: str,
+        headers: Mapping[str, str],
+        close: Callable[[], None] = lambda: None,
+    ) -> None:
         super().__init__(iter(()), media_type=media_type, headers={"Accept-Ranges": "bytes", **headers})
-        self._read, self._size = read, size
+        self._read, self._size, self._close = read, size, close
         self.headers["ETag"] = self._etag = f'"{etag}"'
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._answer(scope, receive, send)
+        finally:
+            self._close()
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         asked = Headers(scope=scope)
         if not {self._etag, "*"} & _tags(asked.get("if-match", "*")):
             await answer(_changed(self._etag), scope["path"])(scope, receive, send)

@@ -34,7 +34,11 @@ def download(
         if archive:
             with bytes_bar("labels") as report:
                 client.labels.archive(job[0] if len(job) == 1 else job, out_dir, format=label_format, progress=report)
-            done(f"{len(job)} jobs in {out_dir}", {"files": [str(out_dir)]}, as_json=as_json)
+            done(
+                f"{'labels' if len(job) == 1 else f'{len(job)} jobs'} in {out_dir}",
+                {"files": [str(out_dir)]},
+                as_json=as_json,
+            )
         else:
             chosen: dict[str, Any] = {"scenes": scene or (), "scans": scan or (), "side": side}
             files = fetch_labels(client, job[0], out_dir, format=label_format, **chosen)

@@ -10,6 +10,7 @@ from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
 
+from l3ps.drivelog import Drive
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.presets import SegmentPreset
 from l3ps.segment.session import Segmenter
@@ -55,6 +56,7 @@ class Context:
         self.store: ObjectStore = open_store(settings)
         self.scratch = Scratch(settings.scratch, settings.scratch_bytes)
         self.owner = f"{worker or new_worker()}{os.getpid()}"
+        self.opened: tuple[tuple[str, bool], Drive] | None = None  # the last stage's; its key tells which
         self._segmenters: OrderedDict[tuple[str, float, SegmentPreset], Segmenter] = OrderedDict()
 
     def segmenter(self, sha256: str, bundle: Path, min_area: float, look: SegmentPreset) -> Segmenter:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
 
 import structlog
 
@@ -19,6 +22,12 @@ log = structlog.get_logger(__name__)
 _PATIENCE = 30.0
 """Seconds to wait for an output that is being deleted: the sweep takes one round of the reconciler for it."""
 _PAUSE = 0.5
+_AT_ONCE = 8
+"""Requests under way at the store: a small object costs its answer's way, tens of ms in a cloud, and hardly any bytes.
+The store's client keeps so many connections."""
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 
 def pin(context: Context, claim: workflow.Claim, prefix: str, progress: Progress) -> None:
@@ -62,3 +71,20 @@ def is_whole(store: ObjectStore, prefix: str, files: Iterable[Json]) -> bool:
     """
     found = {info.key: info.size for info in store.list(f"{prefix}/")}
     return all(found.get(file["key"]) == file["size"] for file in files)
+
+
+@contextmanager
+def side_by_side(act: Callable[[_In], _Out], items: Iterable[_In]) -> Iterator[Iterator[_Out]]:
+    """Ask the store for many small things at once; gives the answers in the order of the items.
+
+    Args:
+        act: asks for one; runs in a thread.
+        items: what it is called with.
+
+    Whoever takes the answers meets what ``act`` raises; what has not begun when the block ends never does.
+    """
+    pool = ThreadPoolExecutor(_AT_ONCE)
+    try:
+        yield pool.map(act, items)
+    finally:
+        pool.shutdown(cancel_futures=True)

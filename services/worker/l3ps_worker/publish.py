@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
+from contextlib import suppress
+from functools import partial
 
 from l3ps.errors import ProcessingError
 from l3ps.evaluate import PanopticEvaluator, mean_estimates
 from l3ps.progress import Progress
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Json, StageName, StageRow, StageState, bundles, jobs, stages
+from l3ps_platform.catalog import Json, SceneRow, StageName, StageRow, StageState, bundles, jobs, stages
 from l3ps_platform.errors import ObjectMissing
 from l3ps_worker.context import Context
-from l3ps_worker.outputs import is_whole
+from l3ps_worker.outputs import is_whole, side_by_side
 from l3ps_worker.work import Done
 
 JOINED = ("poses.txt", "scans.txt")
@@ -34,16 +36,14 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     joined = dict.fromkeys(JOINED, b"")
     judged: dict[str, Json] = {}
     qualities: list[Json | None] = []
-    for done, (scene, stage) in enumerate(finished, start=1):
-        scene_manifest = _scene_manifest(context, scene.name, stage.output_key or "")
-        for file in scene_manifest["files"]:
-            if file["path"] in joined:
-                joined[file["path"]] += context.store.get_bytes(file["key"])
-            else:
-                files.append({**file, "scene": scene.name})
-        judged[scene.name] = {key: scene_manifest.get(key, []) for key in ("estimates", "warnings")}
-        qualities.append(scene_manifest.get("quality", scene.quality))
-        progress("publish", done, len(finished))
+    with side_by_side(partial(_stored, context), finished) as stored:
+        for done, ((scene, _), (scene_manifest, whole)) in enumerate(zip(finished, stored, strict=True), start=1):
+            for path, data in whole.items():
+                joined[path] += data
+            files += [{**file, "scene": scene.name} for file in scene_manifest["files"] if file["path"] not in joined]
+            judged[scene.name] = {key: scene_manifest.get(key, []) for key in ("estimates", "warnings")}
+            qualities.append(scene_manifest.get("quality", scene.quality))
+            progress("publish", done, len(finished))
     for path, data in joined.items():
         key = f"{prefix}/{path}"
         context.store.put_bytes(key, data)
@@ -74,16 +74,20 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     )
 
 
-def _scene_manifest(context: Context, scene: str, key: str) -> Json:
-    """What a scene's refine stage stored. ProcessingError where it is not all there: a retry makes it anew."""
-    try:
+def _stored(context: Context, finished: tuple[SceneRow, StageRow]) -> tuple[Json, dict[str, bytes]]:
+    """What a scene's refine stage stored: its manifest, and the files to join.
+
+    Raises:
+        ProcessingError: it is not all there; a retry of the job makes it anew.
+    """
+    scene, key = finished[0], finished[1].output_key or ""
+    with suppress(ObjectMissing):
         manifest: Json = json.loads(context.store.get_bytes(key))
         if is_whole(context.store, key.rpartition("/")[0], manifest["files"]):
-            return manifest
+            joined = [file for file in manifest["files"] if file["path"] in JOINED]
+            return manifest, {file["path"]: context.store.get_bytes(file["key"]) for file in joined}
         context.store.delete(key)  # by it the retry sees what is there
-    except ObjectMissing:
-        pass
-    raise ProcessingError(f"labels of scene {scene!r} are gone from the store: retry the job")
+    raise ProcessingError(f"labels of scene {scene.name!r} are gone from the store: retry the job")
 
 
 def job_quality(scenes: Iterable[Json | None]) -> Json | None:

@@ -34,7 +34,7 @@ from l3ps_platform.objects import segment as key_segment
 from l3ps_worker.arrays import read_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import refine_key
-from l3ps_worker.outputs import is_whole, pin
+from l3ps_worker.outputs import is_whole, pin, side_by_side
 from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work, sha256_of
 
 log = structlog.get_logger(__name__)
@@ -176,8 +176,13 @@ def _store(context: Context, prefix: str, out: Path, files: Sequence[WrittenFile
     ]
     contents = "".join(f"{entry['sha256']}  {entry['path']}\n" for entry in entries)
     folder = f"{prefix}/{hashlib.sha256(contents.encode()).hexdigest()[:16]}"
-    for done, (file, entry) in enumerate(zip(files, entries, strict=True), start=1):
+    for entry in entries:
         entry["key"] = "/".join([folder, *map(key_segment, entry["path"].split("/"))])
-        context.store.put_file(entry["key"], file.path)
-        progress("store", done, len(files))
+
+    def put(entry: Json) -> None:
+        context.store.put_file(entry["key"], out / entry["path"])
+
+    with side_by_side(put, entries) as puts:
+        for done, _ in enumerate(puts, start=1):
+            progress("store", done, len(entries))
     return entries

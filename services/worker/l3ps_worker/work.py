@@ -111,13 +111,27 @@ def scene_work(context: Context, claim: workflow.Claim) -> SceneWork:
 def opened_scene(context: Context, work: SceneWork, progress: Progress) -> Iterator[tuple[Drive, Scene]]:
     """The stage's drive, unpacked in the scratch, and its scene; bad scans left out where the job says so."""
     with unpacked(context, work.drive, progress) as root:
-        drive = open_drive(root)
-        if work.skip:
-            drive = without_bad_scans(drive, validate(drive, progress))
+        drive = _opened(context, work, root, progress)
         scene = next((scene for scene in drive.scenes if scene.name == work.scene.name), None)
         if scene is None:
             raise ProcessingError(f"drive {work.drive.id} has no scene {work.scene.name!r}: upload the drive again")
         yield drive, scene
+
+
+def _opened(context: Context, work: SceneWork, root: Path, progress: Progress) -> Drive:
+    """The drive without what is to be skipped; read once for the scenes that this process does of it in a row.
+
+    Tables and, where bad scans are skipped, all points of a log: for each scene again, that grows with its square.
+    """
+    assert work.drive.sha256 is not None
+    key = (work.drive.sha256, work.skip)
+    if context.opened is None or context.opened[0] != key:
+        context.opened = None  # one at a time: a long log's scans take hundreds of megabytes
+        drive = open_drive(root)
+        if work.skip:
+            drive = without_bad_scans(drive, validate(drive, progress))
+        context.opened = key, drive
+    return context.opened[1]
 
 
 @contextmanager

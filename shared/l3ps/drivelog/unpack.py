@@ -19,7 +19,7 @@ from typing import BinaryIO, Final
 
 from ..errors import DriveLogError, Problem, ProcessingError
 from ..progress import Progress, silent
-from .archive_formats import ArchiveFault, Kind, Member, sniff, tar_members, zip_members
+from .archive_formats import ArchiveFault, Kind, Member, refuse_beyond, sniff, tar_files, tar_members, zip_members
 from .archive_names import shown
 from .open import open_drive
 from .types import Drive
@@ -215,6 +215,8 @@ def _members(kind: Kind, file: BinaryIO, size: int, budget: Budget) -> Iterator[
     if kind == "zip":
         yield from zip_members(file, size, budget.limits.max_files)
         return
+    if kind == "tar":
+        refuse_beyond(budget.limits.max_files, tar_files(file, size, budget.limits.max_files))
     # Members of a tar are a view of one stream, so the stream is what is counted: headers and padding too.
     with _uncompressed(kind, file) as read:
         yield from tar_members(budget.counted(read))

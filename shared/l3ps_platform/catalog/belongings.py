@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -28,8 +30,14 @@ def group_of(key: str) -> str:
     return "/".join(parts[: 3 if parts[0] == "stages" and parts[1].startswith("prj_") else 2])
 
 
-def owned(session: Session, group: str) -> bool:
-    """Whether a row refers to objects of a group."""
+def owned(session: Session, group: str, keys: Collection[str]) -> bool:
+    """Whether a row refers to objects of a group.
+
+    Args:
+        session: the session.
+        group: their common prefix.
+        keys: of the objects, where they are an upload's.
+    """
     top, id = group.split("/")[:2]
     if top == "stages":
         return session.get(OutputRow, group) is not None
@@ -37,12 +45,13 @@ def owned(session: Session, group: str) -> bool:
         job = session.get(JobRow, id)
         return job is not None and job.swept_at is None
     if top == "trainings":
-        return session.get(TrainingRow, id) is not None
+        training = session.get(TrainingRow, id)
+        return training is not None and (training.log_key is not None or not training.state.final)
     upload = session.get(UploadRow, id)
     if upload is not None and upload.state is UploadState.OPEN:
         return True
-    below = (select(kind.id).where(kind.object_key.startswith(f"{group}/", autoescape=True)) for kind in _ARCHIVES)
-    return any(session.scalar(query.limit(1)) is not None for query in below)
+    queries = (select(kind.id).where(kind.object_key.in_(keys)) for kind in _ARCHIVES)
+    return any(session.scalar(query.limit(1)) is not None for query in queries)
 
 
 def project_of_group(session: Session, group: str) -> str | None:

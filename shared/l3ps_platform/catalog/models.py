@@ -38,7 +38,7 @@ class UploadRow(Owned, Base):
 
     __tablename__ = "uploads"
     noun = "upload"
-    __table_args__ = (Index(None, "state", "expires_at"), Index(None, "project_id", "id"))
+    __table_args__ = (Index(None, "state", "expires_at"), Index(None, "project_id", "id"), Index(None, "created_at"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     kind: Mapped[str] = mapped_column(String(16))  # drive | model | annotations
@@ -69,7 +69,7 @@ class DriveRow(Owned, Base):
 
     __tablename__ = "drives"
     noun = "drive"
-    __table_args__ = (Index(None, "project_id", "id"),)
+    __table_args__ = (Index(None, "project_id", "id"), Index(None, "object_key"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str]
@@ -91,7 +91,11 @@ class ModelRow(Owned, Base):
 
     __tablename__ = "models"
     noun = "model"
-    __table_args__ = (UniqueConstraint("project_id", "name"), Index(None, "project_id", "id"))
+    __table_args__ = (
+        UniqueConstraint("project_id", "name"),
+        Index(None, "project_id", "id"),
+        Index(None, "object_key"),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str] = mapped_column(String(200))
@@ -111,7 +115,7 @@ class AnnotationsRow(Owned, Base):
 
     __tablename__ = "annotations"
     noun = "annotations"
-    __table_args__ = (Index(None, "project_id", "id"),)
+    __table_args__ = (Index(None, "project_id", "id"), Index(None, "object_key"))
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     name: Mapped[str]

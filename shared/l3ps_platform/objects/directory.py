@@ -110,6 +110,13 @@ class DirectoryStore:
     @contextmanager
     def open(self, key: str, offset: int = 0) -> Iterator[BinaryIO]:
         """A stream for reading."""
+        file, _ = self.opened(key)
+        with file:
+            file.seek(offset)
+            yield file
+
+    def opened(self, key: str) -> tuple[BinaryIO, ObjectInfo]:
+        """An object's file, to be closed by the caller, and what it is: of one, also when another takes its name."""
         path = self.path_of(key)
         try:
             file = path.open("rb", buffering=0)
@@ -117,13 +124,11 @@ class DirectoryStore:
             raise ObjectMissing(key) from None
         except OSError as error:
             raise StoreUnavailable(f"the object store failed on {key!r}: {error}") from error
-        with file:
-            file.seek(offset)
-            yield file
+        return file, _info(key, os.fstat(file.fileno()))
 
     def stat(self, key: str) -> ObjectInfo:
         """Size, etag and age."""
-        return self._info(key, self.path_of(key))
+        return _info(key, self.path_of(key).stat())
 
     def exists(self, key: str) -> bool:
         """Whether there is such an object."""
@@ -136,7 +141,7 @@ class DirectoryStore:
         paths = (Path(folder) / name for folder, _, names in os.walk(top) for name in names)
         for path in sorted(paths, key=lambda p: p.relative_to(objects).as_posix()):
             with suppress(FileNotFoundError):  # deleted while we walk
-                yield self._info(path.relative_to(objects).as_posix(), path)
+                yield _info(path.relative_to(objects).as_posix(), path.stat())
 
     def delete(self, key: str) -> None:
         """Delete an object and the folders it leaves empty."""
@@ -207,10 +212,6 @@ class DirectoryStore:
     def _path(self, key: str) -> Path:
         return self.root / "objects" / check_key(key)
 
-    def _info(self, key: str, path: Path) -> ObjectInfo:
-        stat = path.stat()
-        return ObjectInfo(key, stat.st_size, f"{stat.st_mtime_ns:x}-{stat.st_size:x}", _utc(stat.st_mtime))
-
     @contextmanager
     def _replacing(self, target: Path) -> Iterator[BinaryIO]:
         """A temporary file that takes the place of ``target`` when complete and on disk."""
@@ -233,6 +234,10 @@ class DirectoryStore:
             finally:
                 fresh.unlink(missing_ok=True)
             return path.read_text().encode()
+
+
+def _info(key: str, stat: os.stat_result) -> ObjectInfo:
+    return ObjectInfo(key, stat.st_size, f"{stat.st_mtime_ns:x}-{stat.st_size:x}", _utc(stat.st_mtime))
 
 
 def _utc(seconds: float) -> datetime:

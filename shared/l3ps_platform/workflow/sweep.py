@@ -10,7 +10,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from datetime import datetime, timedelta
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from itertools import groupby, islice
 from typing import TypeVar
 
@@ -18,7 +19,17 @@ import structlog
 from sqlalchemy import update
 from sqlalchemy.orm import Session
 
-from l3ps_platform.catalog import annotation_sets, belongings, bundles, drives, jobs, outputs, trainings, uploads
+from l3ps_platform.catalog import (
+    annotation_sets,
+    belongings,
+    bundles,
+    drives,
+    jobs,
+    outputs,
+    pruning,
+    trainings,
+    uploads,
+)
 from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, JobRow, ModelRow, TrainingRow, UploadRow
 from l3ps_platform.catalog.output_rows import OutputRow
 from l3ps_platform.catalog.session import Catalog
@@ -38,7 +49,22 @@ BATCH = 100
 PATIENCE = 5
 """Rows that may fail in one round of a step: what a store refuses may take it half a minute each."""
 
+KEPT = timedelta(days=90)
+"""How long the memory of uploads and arrivals that are over is kept, and trainings' logs: nobody asks for an upload's
+end after a quarter of a year, and no bucket tells of an object so late."""
+PRUNE_SECONDS = 3600.0
+PRUNE_BATCH = 1000
+
 Row = TypeVar("Row", AnnotationsRow, DriveRow, JobRow, ModelRow, OutputRow, TrainingRow, UploadRow)
+
+
+@dataclass(slots=True)
+class Group:
+    """Objects of one owner: their common prefix, when the newest was written, and the keys of an upload's, a few."""
+
+    name: str
+    newest: datetime
+    keys: list[str]
 
 
 class Sweeper:
@@ -54,7 +80,8 @@ class Sweeper:
         self._catalog = catalog.whole()
         self._store = store
         self._settings = settings
-        self._walk: Iterator[tuple[str, datetime]] | None = None
+        self._walk: Iterator[Group] | None = None
+        self._next_prune = float("-inf")
         self._next_walk = 0.0
         self._after: dict[object, str] = {}
         self._steps: dict[str, Callable[[], int]] = {
@@ -65,6 +92,7 @@ class Sweeper:
             "trainings": self._sweep_trainings,
             "outputs": self._delete_outputs,
             "orphans": self._sweep_orphans,
+            "pruned": self._prune,
         }
         self.chore = Chore("sweeper", "round", *self._steps)
 
@@ -199,26 +227,32 @@ class Sweeper:
         walk, self._walk = self._walk, None  # from the beginning again, if the store does not list its objects
         groups = list(islice(walk, BATCH))
         count = 0
-        for group, newest in groups:
-            with self.chore.row("orphans", group):
-                count += self._drop_orphan(group, newest)
+        for group in groups:
+            with self.chore.row("orphans", group.name):
+                count += self._drop_orphan(group)
         if len(groups) < BATCH:
             self._next_walk = time.monotonic() + self._settings.orphans_every_seconds
         else:
             self._walk = walk
         return count
 
-    def _groups(self) -> Iterator[tuple[str, datetime]]:
-        """The objects of each owner: their common prefix and the age of the newest."""
+    def _groups(self) -> Iterator[Group]:
+        """The objects of each owner."""
         for top in belongings.TOPS:
             found = (info for info in self._store.list(top) if info.key.count("/") > 1)
-            for group, infos in groupby(found, key=lambda info: belongings.group_of(info.key)):
-                yield group, max(info.modified for info in infos)
+            for name, infos in groupby(found, key=lambda info: belongings.group_of(info.key)):
+                group = Group(name, datetime.min.replace(tzinfo=UTC), [])
+                for info in infos:
+                    group.newest = max(group.newest, info.modified)
+                    if top == "uploads/":
+                        group.keys.append(info.key)
+                yield group
 
-    def _drop_orphan(self, group: str, newest: datetime) -> bool:
+    def _drop_orphan(self, found: Group) -> bool:
+        group = found.name
         with self._catalog.reading() as session:
             before = self._catalog.now(session) - timedelta(seconds=self._settings.orphan_seconds)
-            if newest >= before or belongings.owned(session, group):
+            if found.newest >= before or belongings.owned(session, group, found.keys):
                 return False
             project = belongings.project_of_group(session, group)
         log.info("orphans found", group=group)
@@ -231,6 +265,19 @@ class Sweeper:
                 stage = StageName(group.split("/")[2].partition("-")[0])
                 outputs.hold(tx, group, stage, project).state = OutputState.DOOMED
         return True
+
+    def _prune(self) -> int:
+        """Forget what is long over, in portions; the rest of a large heap in the next rounds."""
+        if time.monotonic() < self._next_prune:
+            return 0
+        count, full = 0, False
+        for forget in (pruning.uploads, pruning.arrivals, pruning.training_logs):
+            with self._catalog.transaction() as tx:
+                gone = forget(tx.session, tx.now - KEPT, PRUNE_BATCH)
+            count, full = count + gone, full or gone == PRUNE_BATCH
+        if not full:
+            self._next_prune = time.monotonic() + PRUNE_SECONDS
+        return count
 
     def _drop_unknown_uploads(self) -> None:
         """Multipart uploads that the catalog does not know: the API died between the store and the row."""

@@ -4,7 +4,6 @@ import json
 import os
 import secrets
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,8 @@ import psycopg
 import pytest
 from fastapi.testclient import TestClient
 from onnx import TensorProto, helper, numpy_helper
+from tests.conftest import wait_until
+from tests.contract.api.receivers import delivered, hooked, ping, receiver  # noqa: F401  (fixtures)
 from typer.testing import CliRunner
 
 from l3ps_api.app import create_app
@@ -96,19 +97,10 @@ class Service:
 
     def wait(self, path: str, until: Callable[[dict], bool], seconds: float = 120) -> dict:
         """The document at a path once it is as wanted."""
-        deadline = time.monotonic() + seconds
-        while not until(document := self.http.get(path).json()):
-            assert time.monotonic() < deadline, document
-            time.sleep(0.1)
+        document: dict = wait_until(lambda: self.http.get(path).json(), until, seconds)
         return document
 
-    @staticmethod
-    def until(true: Callable[[], bool], seconds: float = 60) -> None:
-        """Wait for something to be true."""
-        deadline = time.monotonic() + seconds
-        while not true():
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+    until = staticmethod(wait_until)
 
     def wait_for_drive(self, drive_id: str) -> dict:
         """A drive once it has been checked."""

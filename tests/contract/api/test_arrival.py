@@ -4,7 +4,6 @@ import json
 import os
 import secrets
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import pytest
 from minio import Minio
 from minio.notificationconfig import NotificationConfig, PrefixFilterRule, QueueConfig
 from sqlalchemy import select
-from tests.conftest import free_port, healthy, running
+from tests.conftest import free_port, healthy, running, wait_until
 from tests.contract.api.conftest import Service
 
 from l3ps_api.notifications.service import MAX_ARRIVALS
@@ -140,7 +139,7 @@ def test_an_object_becomes_one_job_however_often_and_however_parallel_it_is_told
         answers = list(hands.map(lambda _: api.tell(*told), range(8)))
     assert sum(answer["accepted"] for answer in answers) == 2
     assert all(answer["accepted"] + answer["known"] == 2 and answer["ignored"] == 1 for answer in answers)
-    _until(lambda: api.http.get(f"/v1/rules/{rule['id']}").json()["latest"].get("job_id"))
+    wait_until(lambda: api.http.get(f"/v1/rules/{rule['id']}").json()["latest"].get("job_id"))
     new = api.sources()
     for source in before:
         new.remove(source)
@@ -203,7 +202,7 @@ def test_a_large_batch_is_answered_at_once_and_all_of_it_becomes_jobs(api):
     assert api.tell(*told) == {"accepted": 0, "known": 200, "ignored": 0}
 
     wanted = sorted(f"s3://fleet/logs/many/{number}.zip" for number in range(200))
-    _until(lambda: [source for source in api.sources() if "/many/" in source] == wanted)
+    wait_until(lambda: [source for source in api.sources() if "/many/" in source] == wanted)
 
 
 def test_rules_and_what_meets_them_at_once_are_bounded(api):
@@ -271,15 +270,8 @@ def test_a_bucket_of_a_real_server_tells_and_each_log_becomes_one_job(api, telli
         telling_minio.fput_object("fleet", f"logs/real/street/{name}", str(small))
     expected = {"Größe 1+2.zip", "in parts.tar.zst", "street"}
     new = {f"s3://fleet/logs/real/{name}" for name in expected}
-    _until(lambda: new <= set(api.sources()))
+    wait_until(lambda: new <= set(api.sources()))
     found = api.sources()
     for source in before:
         found.remove(source)
     assert found == sorted(new)
-
-
-def _until(ready: Callable[[], object], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.1)

@@ -4,11 +4,11 @@ import os
 import signal
 import sys
 import threading
-import time
 
 import httpx
 import psycopg
 import pytest
+from tests.conftest import wait_until
 
 from l3ps_cli.processes import Processes
 from l3ps_cli.stack import free_port
@@ -42,7 +42,7 @@ def api(tmp_path, postgres_url, redis_server):
             port = free_port()
             child = processes.start(f"api-{port}", [sys.executable, "-m", "l3ps_api"], env | {"L3PS_PORT": str(port)})
             url = f"http://127.0.0.1:{port}"
-            wait(lambda: alive(url))
+            wait_until(lambda: alive(url))
             return url, child.pid
 
         yield start
@@ -53,13 +53,6 @@ def alive(url: str) -> bool:
         return httpx.get(f"{url}/healthz").is_success
     except httpx.TransportError:
         return False
-
-
-def wait(until) -> None:
-    deadline = time.monotonic() + 60
-    while not until():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.mark.services
@@ -75,7 +68,7 @@ def test_what_was_made_before_the_kill_answers_the_repetition(api, postgres_url)
         answers = []
         first = threading.Thread(target=lambda: answers.append(post(url)))
         first.start()
-        wait(lambda: ask("SELECT 1 FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"))
+        wait_until(lambda: ask("SELECT 1 FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"))
         os.kill(pid, signal.SIGKILL)
         first.join()
         assert answers == [None], "the client was left without an answer"
@@ -85,7 +78,7 @@ def test_what_was_made_before_the_kill_answers_the_repetition(api, postgres_url)
 
         url, _ = api()
         again = []
-        wait(lambda: again.append(post(url)) or again[-1].status_code != 409)
+        wait_until(lambda: again.append(post(url)) or again[-1].status_code != 409)
         assert again[-1].status_code == 201, again[-1].text
         assert again[-1].json()["id"] == made
         assert ask("SELECT id FROM uploads") == [(made,)], "and it was made once"

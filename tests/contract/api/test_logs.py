@@ -2,7 +2,8 @@
 
 import json
 import re
-import time
+
+from tests.conftest import wait_until
 
 from l3ps_platform.catalog import stages
 
@@ -20,12 +21,13 @@ def lines(service) -> list[dict]:
 
 def answered(service, request: str) -> dict:
     """The line that a request ends with; it is written after the answer has left."""
-    deadline = time.monotonic() + 30
-    while True:
-        for line in lines(service):
-            if (line["event"], line.get("request")) == ("answered", request):
-                return line
-        assert time.monotonic() < deadline
+
+    def ended() -> dict | None:
+        wanted = ("answered", request)
+        return next((line for line in lines(service) if (line["event"], line.get("request")) == wanted), None)
+
+    line: dict = wait_until(ended)
+    return line
 
 
 def test_every_line_parses_and_says_who_and_when(service, observed):

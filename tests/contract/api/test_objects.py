@@ -1,9 +1,8 @@
 """The presigned URLs of the directory store, which the API answers itself, as S3 would."""
 
-import time
-
 import httpx
 import pytest
+from tests.conftest import wait_until
 
 from l3ps_platform.objects import DirectoryStore
 
@@ -61,10 +60,7 @@ def unfinished(store):
 
 def leaves_nothing(store, before):
     """Once the server has noticed the end of the connection; a worker's own half-written files come and go."""
-    deadline = time.monotonic() + 30
-    while left := unfinished(store) - before:
-        assert time.monotonic() < deadline, left
-        time.sleep(0.05)
+    wait_until(lambda: unfinished(store) - before, lambda left: not left)
 
 
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "chunked"])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from tests.conftest import wait_until
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 
@@ -45,10 +46,7 @@ class Up:
 
     def wait_for_a_worker_child(self) -> set[int]:
         """All descendants once the worker has forked: Redis, the API, the worker and at least one of its children."""
-        deadline = time.monotonic() + 60
-        while len(found := self.descendants()) < 4:
-            assert time.monotonic() < deadline, found
-            time.sleep(0.05)
+        found: set[int] = wait_until(self.descendants, lambda found: len(found) >= 4)
         return found
 
     def end(self) -> tuple[int, str, str]:
@@ -96,10 +94,7 @@ def listens(port: int) -> bool:
 def assert_nothing_left(data: Path, pids: set[int], url: str) -> None:
     assert alive(pids) == set()
     # A killed process is a zombie as soon as its first thread has ended; its sockets close with the last.
-    deadline = time.monotonic() + 10
-    while listens(int(url.rpartition(":")[2])):
-        assert time.monotonic() < deadline, "somebody still listens"
-        time.sleep(0.05)
+    wait_until(lambda: not listens(int(url.rpartition(":")[2])), seconds=10)
     assert [path for path in data.rglob("*") if path.is_socket()] == []
 
 

@@ -2,28 +2,38 @@
 
 import os
 import threading
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import text
+from sqlalchemy import select, text
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
+    AnnotationsRow,
     Catalog,
     DriveRow,
     JobRow,
+    JobState,
     OutputRow,
     ProjectRow,
+    TrainingRow,
+    UploadRow,
+    UploadState,
     bundles,
     drives,
     jobs,
     outputs,
     retention,
+    rules,
+    uploads,
 )
 from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.catalog.source_rows import ArrivalRow
 from l3ps_platform.errors import Conflict, LeaseLost, NotFound, OutputDoomed, StoreUnavailable
 from l3ps_platform.objects import DirectoryStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow import sweep
 
 PROJECT = "prj_default"
 
@@ -315,3 +325,51 @@ _OLD_ROWS = (
     "output_key, finished_at) VALUES ('stg_1', 'job_1', 'refine', 'refine', 'done', 1, 0, 0, 1, false, "
     f"'stages/refine-old/scene.json', {_DATE})",
 )
+
+
+def test_what_is_over_for_a_quarter_of_a_year_is_forgotten_and_what_is_not_over_is_kept(house, monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "PRUNE_BATCH", 1)
+    made: dict[str, list[str]] = {"old": [], "new": []}
+    with house.catalog.transaction() as tx:
+        rule = rules.add(tx, name="r", bucket="b", prefix="", suffix=None, settings={})
+        for name, since in (("old", timedelta(days=91)), ("new", timedelta(days=89))):
+            for state in (UploadState.COMPLETE, UploadState.ABORTED, UploadState.OPEN):
+                file = {"kind": "drive", "filename": "f", "size": 1, "parts": 1, "seconds": 10**8}
+                row = uploads.add(tx, object_key=f"uploads/{name}-{state}", s3_upload_id="", **file)
+                row.state, row.created_at = state, tx.now - since
+                made[name].append(row.id)
+            for settled in (tx.now - since, None):
+                (id,) = rules.note(tx, [(rule, f"{name}{settled}", "key", "s3://b/key")])
+                tx.session.get_one(ArrivalRow, id).settled_at = settled
+                made[name].append(id)
+    sweeper = workflow.Sweeper(house.catalog, house.store, Settings())
+    rounds = [sweeper.run_once()["pruned"] for _ in range(4)]
+    assert (rounds, sum(rounds)) == ([2, 1, 0, 0], 3)
+    with house.catalog.reading() as session:
+        left = {*session.scalars(select(UploadRow.id)), *session.scalars(select(ArrivalRow.id))}
+    complete, aborted, still_open, settled, waiting = made["old"]
+    assert left == {*made["new"], still_open, waiting}
+    assert not {complete, aborted, settled} & left
+
+
+def test_the_log_of_a_training_of_long_ago_goes(house) -> None:
+    trainings_ = {}
+    with house.catalog.transaction() as tx:
+        row = AnnotationsRow(id="ann_1", name="a", filename="a.zip", size=1, created_at=tx.now)
+        tx.session.add(row)
+        tx.session.flush()
+        for name, state, since in (
+            ("old", JobState.SUCCEEDED, 91),
+            ("new", JobState.SUCCEEDED, 89),
+            ("running", JobState.RUNNING, None),
+        ):
+            id, log = f"trn_{name}", f"trainings/trn_{name}/log.txt"
+            values = {"id": id, "name": name, "annotations_id": "ann_1", "settings": {}, "state": state, "log_key": log}
+            ended = None if since is None else tx.now - timedelta(days=since)
+            tx.session.add(TrainingRow(created_at=tx.now, finished_at=ended, **values))
+            house.store.put_bytes(log, b"epoch 1")
+            trainings_[name] = log
+    sweeper = workflow.Sweeper(house.catalog, house.store, Settings(orphan_seconds=-1, orphans_every_seconds=0))
+    sweeper.run_once()
+    sweeper.run_once()
+    assert {info.key for info in house.store.list()} == {trainings_["new"], trainings_["running"]}

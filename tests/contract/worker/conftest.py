@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from tests.conftest import wait_until
 
 from l3ps.simulate import simulate_drive
 from l3ps_platform import workflow
@@ -160,13 +160,7 @@ class Bench:
     def manifest(self, job: str) -> dict:
         return json.loads(self.store.get_bytes(f"jobs/{job}/manifest.json"))
 
-    def until(self, ready: Callable[[], object], seconds: float = 90.0) -> object:
-        """Wait for something to be true; its value."""
-        deadline = time.monotonic() + seconds
-        while not (found := ready()):
-            assert time.monotonic() < deadline, "it did not happen in time"
-            time.sleep(0.05)
-        return found
+    until = staticmethod(wait_until)
 
     def finished(self, job: str) -> JobRow:
         self.until(lambda: self.job(job).state.final)

@@ -1,6 +1,7 @@
 """Stage outputs in the store: who reads which, and what is done about those that are not whole."""
 
 import hashlib
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pytest
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import JobState, StageName, StageState, outputs
+from l3ps_platform.errors import StoreUnavailable
 from l3ps_worker import keys, runner
 from l3ps_worker import refine as refining
+from l3ps_worker.outputs import side_by_side
 
 ROAD, PLANTS = 11, 16
 
@@ -148,3 +151,30 @@ def test_the_size_of_labels_is_known_though_their_worker_died_before_noting_it(s
     with bench.catalog.transaction() as tx:
         row = outputs.lock(tx.session, primal.rpartition("/")[0])
         assert row.bytes == bench.store.stat(primal).size > 0
+
+
+def test_the_store_is_asked_for_many_things_at_once_and_answers_in_order() -> None:
+    together = threading.Barrier(8, timeout=60)  # breaks, and with it the test, unless so many wait at it
+
+    def ask(n: int) -> int:
+        together.wait()
+        return n
+
+    with side_by_side(ask, range(16)) as answers:
+        assert list(answers) == list(range(16))
+
+
+def test_a_label_file_that_cannot_be_stored_fails_the_stage(segmented, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, job = segmented
+    real = bench.context.store.put_file
+
+    def full(key: str, path: Path) -> None:
+        if key.endswith("poses.txt"):
+            raise StoreUnavailable("the store takes no more")
+        real(key, path)
+
+    monkeypatch.setattr(bench.context.store, "put_file", full)
+    assert bench.step() == "failed"
+    stage = next(stage for stage in bench.stages(job) if stage.name is StageName.REFINE)
+    assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "store-unavailable")
+    assert not [info for info in bench.store.list("stages/") if info.key.endswith("scene.json")]

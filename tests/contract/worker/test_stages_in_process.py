@@ -21,7 +21,7 @@ from l3ps_platform import workflow
 from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs, stages
 from l3ps_platform.errors import CatalogUnavailable, StoreUnavailable
 from l3ps_platform.workflow.planning import enqueue
-from l3ps_worker import runner
+from l3ps_worker import runner, work
 
 
 def fetch(bench, job: str, target: Path) -> Path:
@@ -411,6 +411,27 @@ def test_a_drive_s_log_is_fetched_again_when_the_scratch_lost_it(direct, drive_z
     (direct.settings.scratch / "cache").mkdir()
     direct.submit(drive)
     assert direct.step() == "done"
+
+
+def test_a_drive_is_read_once_for_scenes_in_a_row(direct, drive_zip: Path, fast_model: Path, monkeypatch) -> None:
+    """A log of 850 scenes takes longer to read than a scene of it to label."""
+    read: list[Path] = []
+
+    def counted(root: Path):
+        read.append(root)
+        return open_drive(root)
+
+    monkeypatch.setattr(work, "open_drive", counted)
+    drive = direct.upload_drive(drive_zip)
+    direct.upload_model(fast_model)
+    direct.run()
+    job = direct.submit(drive, preset="fast")
+    assert direct.step() == "done"
+    shutil.rmtree(direct.settings.scratch / "cache")  # evicted between the stages: fetched, not read again
+    (direct.settings.scratch / "cache").mkdir()
+    assert set(direct.run()) == {"done"}
+    assert direct.job(job).state is JobState.SUCCEEDED
+    assert len(read) == 1
 
 
 def test_what_a_stage_makes_stays_while_a_job_that_was_not_deleted_uses_it(

@@ -1,11 +1,15 @@
 """A body of known length over ASGI: what is read of it, and when reading ends."""
 
 import asyncio
+from types import SimpleNamespace
 
 import pytest
 
+from l3ps_api.objects import service as objects
 from l3ps_api.ranges import RangedResponse, byte_range
 from l3ps_platform.errors import StoreUnavailable
+from l3ps_platform.objects import DirectoryStore
+from l3ps_platform.objects.signing import Grant
 
 BLOCKS, BLOCK = 1000, 1 << 16
 
@@ -82,6 +86,28 @@ def test_a_source_that_fails_ends_the_answer_unfinished() -> None:
     with pytest.raises(StoreUnavailable):
         answered(source)
     assert source.closed
+
+
+@pytest.mark.parametrize("headers", [{}, {"range": "bytes=3-5"}, {"if-none-match": "*"}, {"range": "bytes=99-"}])
+def test_an_object_is_sent_as_it_was_when_its_answer_began(tmp_path, headers) -> None:
+    """Another may take its name in between: then neither length nor bytes may be the new one's."""
+    store = DirectoryStore(tmp_path, "http://here")
+    store.put_bytes("a/b.bin", b"old bytes")
+    response = objects.send(SimpleNamespace(store=store), Grant("GET", "a/b.bin"))
+    file = response._close.__self__
+    store.put_bytes("a/b.bin", b"and newer ones")
+    sent: list[dict] = []
+
+    async def send(message: dict) -> None:
+        sent.append(message)
+
+    given = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "http", "method": "GET", "path": "/x", "headers": given, "asgi": {"spec_version": "2.4"}}
+    asyncio.run(response(scope, None, send))
+    body = b"".join(message.get("body", b"") for message in sent)
+    expected = {200: b"old bytes", 206: b" by", 304: b""}
+    assert body == expected.get(sent[0]["status"], body)
+    assert file.closed
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import zstandard
 
 from l3ps.drivelog import UnpackLimits
 
-from .unpacking import TAR, WHOLE, add_files, tarred, zipped
+from .unpacking import FILES, TAR, WHOLE, add_files, tarred, zipped
 
 BIG = {"log/zeros": b"\0" * 3_000_000}
 BOMB_LIMITS = UnpackLimits(ratio_free_bytes=1_000_000)
@@ -58,6 +58,19 @@ def test_zip_whose_members_share_their_data(place):
 
 def test_entries_are_counted_before_they_are_held(place):
     assert place.refused(many_entries(50), UnpackLimits(max_files=49))[0] == "too-many-files"
+
+
+def test_files_of_a_tar_are_counted_before_the_first_is_looked_at(place):
+    """A million empty ones would take minutes to make and to delete."""
+    files = {"../evil": bytes(700)} | {f"log/{n}-{'x' * 3 * n}": bytes(n) for n in range(49)}
+    content = tarred(lambda archive: add_files(archive, files))
+    assert place.refused(content, UnpackLimits(max_files=50))[0] == "too-many-files"
+    assert place.refused(content, UnpackLimits(max_files=51))[0] == "unsafe-path"
+
+
+@pytest.mark.parametrize("kind", ["zip", "gz", "zst", "pax", "gnu", "ustar"])
+def test_as_many_files_and_folders_as_the_limit_says_are_taken(place, kind):
+    assert place.unpack(WHOLE[kind], UnpackLimits(max_files=6)) == FILES  # three, in two folders, and the target
 
 
 @pytest.mark.parametrize("kind", ["zip", "gz", "zst", "pax"])

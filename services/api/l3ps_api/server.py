@@ -1,0 +1,78 @@
+"""The HTTP server, with the limits of a connection that uvicorn leaves to a proxy."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import socket
+
+import h11
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from l3ps_api.events.hub import EventHub
+from l3ps_api.middleware import HEADER_BYTES
+
+HEAD_BYTES = 4 * HEADER_BYTES
+"""A request's head that is not complete by then is refused by the server; smaller ones get a problem document."""
+_OTHER_FILES = 200  # databases, logs, the interpreter's own
+_MOST_FILES = 1 << 16
+
+
+class Protocol(H11Protocol):
+    """Hangs up on a client that does not get its headers out in time; each such connection holds an open file.
+
+    h11, whatever else is installed: it has a limit for a head that is not complete (:data:`HEAD_BYTES`).
+    """
+
+    HEADER_SECONDS = 20.0
+    _hang_up: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """A client has come."""
+        super().connection_made(transport)
+        self._expect_headers()
+
+    def data_received(self, data: bytes) -> None:
+        """Some of a request."""
+        super().data_received(data)
+        if self.conn.their_state is h11.IDLE:
+            self._expect_headers()
+        else:
+            self._expect_no_more()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has gone."""
+        self._expect_no_more()
+        super().connection_lost(exc)
+
+    def _expect_headers(self) -> None:
+        # Not from anew with each byte: then a byte now and then were enough.
+        self._hang_up = self._hang_up or self.loop.call_later(self.HEADER_SECONDS, self.transport.abort)
+
+    def _expect_no_more(self) -> None:
+        if self._hang_up is not None:
+            self._hang_up.cancel()
+            self._hang_up = None
+
+
+class Server(uvicorn.Server):
+    """Tells streams that the process stops: they have no other end, and the server waits for all answers to end."""
+
+    def __init__(self, config: uvicorn.Config, streams: EventHub) -> None:
+        super().__init__(config)
+        self._streams = streams
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop serving."""
+        self._streams.close()
+        await super().shutdown(sockets)
+
+
+def most_connections() -> int:
+    """How many connections the process can have: each may take another file, of the store's. Raises the soft limit."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    return (wanted - _OTHER_FILES) // 2
