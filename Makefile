@@ -21,7 +21,7 @@ hostile: servers ## every hostile upload on both stacks, a million empty files a
 	L3PS_HOSTILE="$(or $(ONLY),.)" $(RUN) pytest tests/hostile --timeout 3600
 
 chaos: servers ## kill real processes and servers under running jobs; SCENARIO=name runs one; writes chaos-report.md
-	L3PS_CHAOS=1 $(RUN) pytest tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
+	L3PS_CHAOS=1 $(RUN) pytest --timeout 900 tests/chaos $(if $(SCENARIO),-k "$(SCENARIO)")
 
 bench-scaling: servers ## the same scenes with one worker and with two, one thread each
 	$(RUN) python tests/load/scaling.py

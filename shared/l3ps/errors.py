@@ -7,6 +7,7 @@
     │   ├── LabelError        label files
     │   └── AnnotationError   annotated images to train from (carries every problem found, up to a bound)
     ├── ProcessingError       a stage could not do its work on valid input (odometry diverged, …)
+    ├── Starved               the machine had too little memory or time for it; later or elsewhere it may work
     └── Cancelled             the caller asked to stop
 
 Every message is one sentence that a person who has never seen the code can act on.
@@ -82,6 +83,18 @@ class AnnotationError(InputError):
 
 class ProcessingError(L3psError):
     """A stage could not do its work on valid input."""
+
+
+class Starved(L3psError):  # noqa: N818  (what the machine did, no fault of the input)
+    """The machine had too little of something; later, or on another one, the same may work.
+
+    Attributes:
+        lack: of what.
+    """
+
+    def __init__(self, message: str, lack: Literal["memory", "time"]) -> None:
+        self.lack = lack
+        super().__init__(message)
 
 
 class Cancelled(L3psError):  # noqa: N818  (it is a request carried out, not an error)

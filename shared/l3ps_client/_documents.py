@@ -58,6 +58,7 @@ class Drive(_File):
     format: str | None
     state: FileState
     problems: list[ErrorItem]
+    problem_count: NotRequired[int]
     info: dict[str, Any] | None
 
 
@@ -201,6 +202,7 @@ class Upload(TypedDict):
     part_size: NotRequired[int]
     parts: NotRequired[list[PartUrl]]
     received: NotRequired[list[ReceivedPart]]
+    joined: NotRequired[bool]
 
 
 class LabelFile(TypedDict):
@@ -221,6 +223,7 @@ class LabelFiles(TypedDict):
     job_id: str
     format: str
     files: list[LabelFile]
+    next: NotRequired[str | None]
 
 
 class Me(TypedDict):

@@ -16,6 +16,8 @@ from l3ps_client._resource import Group, path
 from l3ps_client._sending import Progress
 
 _BLOCK = 1 << 20
+_PAGE = 1000
+"""Files listed at a time."""
 
 
 def _quietly(done: int, total: int) -> None:
@@ -44,8 +46,14 @@ class Labels(Group):
             side: only ``primal`` or only ``refined`` labels.
         """
         where = path("jobs", job_id, "labels")
-        files: LabelFiles = self._wire.get(where, format=format, scene=scene, scan=scan, side=side)
-        return files
+        filters = {"format": format, "scene": scene, "scan": scan, "side": side}
+        listing: LabelFiles = self._wire.get(where, **filters, limit=_PAGE)
+        cursor = listing.pop("next", None)
+        while cursor is not None:
+            page: LabelFiles = self._wire.get(where, **filters, limit=_PAGE, cursor=cursor)
+            listing["files"] += page["files"]
+            cursor = page.get("next")
+        return listing
 
     def download(
         self,

@@ -73,7 +73,7 @@ class Ledger:
         finally:
             if file is not None and self.folder is not None:
                 if not note.facts:
-                    (self.folder / f"{name}.json").unlink(missing_ok=True)
+                    _delete(self.folder / f"{name}.json", file)
                 file.close()
 
     def of_file(self, path: Path) -> list[dict[str, Any]]:
@@ -92,19 +92,17 @@ class Ledger:
         """The note's file, locked; None where there can be none."""
         if self.folder is None:
             return None
+        path = self.folder / f"{name}.json"
         try:
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._drop_old()
-            file = os.fdopen(os.open(self.folder / f"{name}.json", os.O_RDWR | os.O_CREAT, 0o600), "r+")
+            while True:
+                file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+")
+                if _lock(file, path):
+                    return file
+                file.close()
         except OSError:
             return None
-        try:
-            if sys.platform != "win32":  # there two processes with the same file would share its upload
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.close()
-            return None
-        return file
 
     def _drop_old(self) -> None:
         assert self.folder is not None
@@ -112,6 +110,27 @@ class Ledger:
             with suppress(OSError):
                 if path.stat().st_mtime < time.time() - _KEEP_SECONDS:
                     path.unlink()
+
+
+def _lock(file: IO[str], path: Path) -> bool:
+    """Take a note for this process. OSError where another has it; False where that one has just deleted it."""
+    if sys.platform == "win32":  # there two processes with the same file would share its upload
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+    except OSError:
+        file.close()
+        raise
+
+
+def _delete(path: Path, file: IO[str]) -> None:
+    """Delete a note: while it is locked, so that nobody else holds it; Windows deletes no file that is open."""
+    if sys.platform == "win32":
+        file.close()
+    path.unlink(missing_ok=True)
 
 
 def _read(file: IO[str]) -> dict[str, Any]:

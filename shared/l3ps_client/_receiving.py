@@ -98,7 +98,9 @@ def receive(wire: Wire, source: Source, target: Path, count: Count) -> None:
 def inside(path: str) -> PurePosixPath:
     """A path of the service's listing; Damaged when it would leave the folder the files go to."""
     relative = PurePosixPath(path)
-    if relative.is_absolute() or ".." in relative.parts or not relative.parts or "\0" in path or "\\" in path:
+    # Windows reads a backslash as a separator, and takes C:name for a file in the present folder of drive C.
+    strange = any(character in path for character in "\0\\:")
+    if relative.is_absolute() or ".." in relative.parts or not relative.parts or strange:
         raise Damaged(f"The service names a file outside the target directory: {path!r}. Nothing written.")
     return relative
 

@@ -4,7 +4,8 @@
     send ───── PUT each part to its URL ──────► its ETag, compared with its MD5  the whole's SHA-256 beside it
     complete ─ POST /v1/uploads/{id}/complete ► the drive, model or annotations  note removed
 
-A process that finds a note asks the service what it has got and sends the rest.
+A process that finds a note asks the service what it has got and sends the rest. Where the service has joined the parts
+and died before it could say so, the completion is all that is left to send.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from threading import Event, Lock
 from typing import Any, Literal
 
 from l3ps_client._documents import Upload
-from l3ps_client._errors import Damaged, Forbidden, L3psClientError, NotFound, Refused, TooManyRequests
+from l3ps_client._errors import Damaged, Forbidden, L3psClientError, NotFound, Refused
 from l3ps_client._ledger import Ledger, Note
 from l3ps_client._wire import Wire, new_key
 
@@ -34,6 +35,10 @@ FOLDERS = {"drive": "drives", "model": "models", "annotations": "annotations"}
 _BLOCK = 1 << 18
 """Bytes read and sent in one go: httpcore copies what the socket leaves of a block, so larger ones are slower."""
 _URLS_AT_ONCE = 200
+_NOT_THE_UPLOAD = (401, 403, 408, 421, 429)
+"""Refusals of the one who asks, or of the moment: with another key, or later, the same upload goes on."""
+_GOES_ON = ("request-in-progress", "conflict", "invalid-parts")
+"""Refusals that leave the upload as it is: another request has it in hand, or parts are to be sent again."""
 _MD5 = re.compile(r"[0-9a-f]{32}")
 
 
@@ -75,7 +80,8 @@ def send(wire: Wire, ledger: Ledger, file: Path, options: Options, progress: Pro
             sha256 = transfer.run()
             if (file.stat().st_size, file.stat().st_mtime_ns) != (status.st_size, status.st_mtime_ns):
                 raise Damaged(f"{file} changed while it was sent; nothing was kept. Send it again once it is written.")
-            completion = {"parts": transfer.tags(), "sha256": sha256} | ({"name": options.name} if options.name else {})
+            completion: dict[str, Any] = {"sha256": sha256} | ({"name": options.name} if options.name else {})
+            completion |= {"parts": tags} if (tags := transfer.tags()) else {}
             result = wire.post(f"/v1/uploads/{upload['id']}/complete", completion)
         except BaseException as error:
             if options.abort_on_error or not note.lasting or _is_final(error):
@@ -108,8 +114,9 @@ def _announced(wire: Wire, note: Note, file: Path, size: int, options: Options) 
         note.save(path=str(file.resolve()), name=options.name, key=new_key(), announced=body)
     try:
         upload: Upload = wire.post("/v1/uploads", note.facts["announced"], key=note.facts["key"])
-    except Refused:
-        note.forget()
+    except Refused as error:
+        if error.code not in _GOES_ON:
+            note.forget()
         raise
     note.save(upload_id=upload["id"])
     return upload
@@ -118,7 +125,7 @@ def _announced(wire: Wire, note: Note, file: Path, size: int, options: Options) 
 def _is_final(error: BaseException) -> bool:
     """Whether the same upload would fail again, so that there is nothing to go on with."""
     if isinstance(error, Refused):
-        return error.status < 500 and not isinstance(error, TooManyRequests)
+        return error.status < 500 and error.status not in _NOT_THE_UPLOAD and error.code not in _GOES_ON
     return isinstance(error, Damaged)
 
 
@@ -132,7 +139,9 @@ class _Transfer:
     def __init__(self, wire: Wire, file: Path, upload: Upload, options: Options, progress: Progress) -> None:
         self._wire, self._file, self._upload, self._options = wire, file, upload, options
         self._size, self._part_size = upload["size"], upload["part_size"]
-        self._numbers = range(1, max(1, -(-self._size // self._part_size)) + 1)
+        # Of an upload that was joined before its service died no part is wanted, only the completion.
+        count = 0 if upload.get("joined") else max(1, -(-self._size // self._part_size))
+        self._numbers = range(1, count + 1)
         self._urls = {part["number"]: part["url"] for part in upload.get("parts", [])}
         self._there = {part["number"]: part for part in upload.get("received", [])}
         self._etags: dict[int, str] = {}
@@ -153,6 +162,8 @@ class _Transfer:
         failures = [error for future in [*work, digest] if (error := future.exception()) is not None]
         if failures:
             raise next((error for error in failures if not isinstance(error, _StoppedError)), failures[0])
+        if not self._numbers:
+            self._advance(self._size)
         sha256: str = digest.result()
         return sha256
 

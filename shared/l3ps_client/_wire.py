@@ -36,12 +36,15 @@ class Retry:
         first: seconds before the second try; doubled for each further one, with a quarter of jitter.
         longest: bound of these pauses, seconds.
         longest_wait: bound of what ``Retry-After`` may ask for, seconds; a longer one is reported at once.
+        in_progress: seconds that the answer to a POST is asked for while the service says that it is still at it. That
+            uses up no try: the service goes on, and takes a request whose process died for dead after a minute.
     """
 
     tries: int = 4
     first: float = 0.2
     longest: float = 10.0
     longest_wait: float = 30.0
+    in_progress: float = 600.0
 
     def pause(self, attempt: int) -> float:
         """Seconds between this try, counted from 1, and the next."""
@@ -156,8 +159,10 @@ class Wire:
         return str(httpx.URL(f"{self.config.url}/").join(url))
 
     def _until_answered(self, send: Callable[[], httpx.Response], tries: int, sleep: Sleep) -> httpx.Response:
-        for attempt in range(1, tries + 1):
-            last = attempt == tries
+        began, attempt = time.monotonic(), 0
+        while True:
+            attempt += 1
+            last = attempt >= tries
             try:
                 answer = send()
             except httpx.TransportError as error:
@@ -168,16 +173,17 @@ class Wire:
             if not answer.is_error:
                 return answer
             pause = self._pause_before_repeat(answer, attempt)
+            if _in_progress(answer):
+                last = time.monotonic() - began >= self.retry.in_progress
+                attempt -= 1
             if last or pause is None:
                 raise refusal(answer)
             sleep(pause)
-        raise AssertionError("a request is tried at least once")
 
     def _pause_before_repeat(self, answer: httpx.Response, attempt: int) -> float | None:
         """Seconds until the same request makes sense again, None where it never will or not soon."""
         after = retry_after(answer)
-        # A conflict that names a time is the same POST, still being carried out for an answer that was lost.
-        if answer.status_code in _LATER or (answer.status_code == 409 and after is not None):
+        if answer.status_code in _LATER or _in_progress(answer):
             pause = self.retry.pause(attempt) if after is None else after
             return pause if pause <= self.retry.longest_wait else None
         return self.retry.pause(attempt) if answer.status_code in _NOT_THE_SERVICE else None
@@ -209,6 +215,11 @@ def retry_after(answer: httpx.Response) -> float | None:
         when = parsedate_to_datetime(value)
         return max(0.0, (when - datetime.now(when.tzinfo or UTC)).total_seconds())
     return None
+
+
+def _in_progress(answer: httpx.Response) -> bool:
+    """Whether this is the same POST, still being carried out for an answer that was lost: a conflict with a time."""
+    return answer.status_code == 409 and retry_after(answer) is not None
 
 
 def refusal(answer: httpx.Response) -> Exception:

@@ -27,10 +27,25 @@ TASK_NAMES = {name: f"l3ps.{name.value}" for name in StageName}
 
 _UNACKED, _UNACKED_INDEX = "unacked", "unacked_index"
 """Where kombu keeps the messages that were delivered and not acknowledged."""
+_READ = 1000
+"""Messages read at a time, a kB each: 100,000 at once would be 100 MB in the API and hold Redis up for all others."""
 
 
-def make_app(settings: Settings) -> Celery:
-    """The Celery application of workers and clients alike."""
+WORKER_WAITS = 10.0
+"""Seconds within which Redis must answer a worker. Those of a worker that asks for messages are answered after one
+second at the latest (kombu's ``brpop_timeout``), message or not."""
+SENDER_WAITS = 2.0
+"""The same for a sender. A request is waiting for it, and what is not sent the reconciler sends later."""
+
+
+def make_app(settings: Settings, redis_waits: float = WORKER_WAITS) -> Celery:
+    """The Celery application of workers and clients alike.
+
+    Args:
+        settings: where the queue is, and how long stages take.
+        redis_waits: seconds within which Redis must answer. Without a limit a Redis that hangs, or a connection that
+            was cut in silence, is waited for until the kernel gives it up, after hours.
+    """
     app = Celery("l3ps", broker=settings.broker_url)
     transport = {
         # The shortest of the three places wins, so all three get the same.
@@ -39,6 +54,7 @@ def make_app(settings: Settings) -> Celery:
         "unacked_restore_interval": 1,
         "unacked_restore_throttle": 1,
         "socket_connect_timeout": 2,
+        "socket_timeout": redis_waits,
         "socket_keepalive": True,
         "health_check_interval": 25,
     }
@@ -84,7 +100,7 @@ class Queue:
     """Sending side and gauges of the queue."""
 
     def __init__(self, settings: Settings) -> None:
-        self._app = make_app(settings)
+        self._app = make_app(settings, SENDER_WAITS)
         self._redis: redis.Redis = redis.Redis.from_url(
             settings.redis_url, socket_connect_timeout=2, socket_timeout=5, health_check_interval=25
         )
@@ -111,10 +127,16 @@ class Queue:
             return {name: self._redis.llen(name.value) for name in QueueName}
 
     def pending(self, queue: QueueName) -> set[tuple[str, int]]:
-        """The (stage id, attempt) of every message waiting in a queue."""
+        """The (stage id, attempt) of every message that waits in a queue from the beginning of the call to its end."""
+        found: set[tuple[str, int]] = set()
+        first = 0
         with _RedisErrors():
-            raw = cast("list[bytes]", self._redis.lrange(queue.value, 0, -1))
-        return {pair for message in raw if (pair := _identity(message)) is not None}
+            # New messages come in before the first and move the others on, so that some are read twice and none is
+            # passed over; what is taken leaves at the end.
+            while raw := cast("list[bytes]", self._redis.lrange(queue.value, first, first + _READ - 1)):
+                found.update(pair for message in raw if (pair := _identity(message)) is not None)
+                first += len(raw)
+        return found
 
     def delivered(self) -> dict[str, tuple[str, int]]:
         """The (stage id, attempt) of every message that a worker took and has not acknowledged, by its tag.

@@ -88,6 +88,7 @@ class Settings(BaseSettings):
     # How long a process believes what it has read about a key. In the process that revokes one it ends at once.
     key_cache_seconds: float = Field(default=2.0, ge=0)
     max_open_uploads: int = Field(default=1000, ge=1)  # of a project
+    max_open_upload_bytes: int = Field(default=1024 * GiB, ge=1)  # of a project: sixteen of the largest at once
     max_active_jobs: int = Field(default=1000, ge=1)  # of a project, trainings too
 
     idempotency_seconds: float = Field(default=24 * 3600.0, gt=0)  # life of an Idempotency-Key
@@ -125,7 +126,7 @@ class Settings(BaseSettings):
     max_attempts: int = 3
     retry_seconds: float = 5.0  # back-off: 5 s, 10 s, 20 s …
     # While the object store or the catalog is away, or the disk is full, a stage uses up no attempt. It is tried again
-    # after as long as the outage has lasted, at most after this, and fails when the outage lasts this long.
+    # after as long as it has waited already, at most after this, and fails when it has waited this long in all.
     outage_retry_seconds: float = 60.0
     outage_seconds: float = 6 * 3600.0
     reconcile_seconds: float = 5.0

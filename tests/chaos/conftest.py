@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 if os.environ.get("L3PS_CHAOS"):
     from chaoslib import checks, report, workload
+    from chaoslib.embedded import Embedded
     from chaoslib.servers import Minio, Postgres, Redis
     from chaoslib.stack import Servers, Service
 
@@ -75,6 +76,12 @@ class Scenario:
         servers.redis.start()
         self.service = Service(folder, servers, work, self.note, **options)
         return self.service
+
+    def embedded(self, **options: Any) -> "Embedded":
+        """`l3ps up` instead of servers and services one by one."""
+        folder, servers, work = self._given
+        self.service = service = Embedded(folder, servers, work, self.note, **options)
+        return service
 
     def stop(self) -> None:
         """Stop everything of the scenario and see that nothing of it lives on."""

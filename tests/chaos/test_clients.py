@@ -3,9 +3,9 @@
 import threading
 import time
 from collections import Counter
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
+from chaoslib.receiver import Receiver, slowly
 from chaoslib.servers import wait_until
 from chaoslib.workload import CASES
 
@@ -157,50 +157,17 @@ def test_same_post_twice(scenario, ends_well) -> None:
     ends_well(service)
 
 
-class Receiver:
-    """A webhook receiver that answers as told and remembers what came."""
-
-    def __init__(self, host: str, answer) -> None:
-        received = self.received = []
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-                received.append((self.headers.get("webhook-id"), body))
-                status, headers = answer(len(received))
-                self.send_response(status)
-                for name, value in headers.items():
-                    self.send_header(name, value)
-                self.send_header("Content-Length", "0")
-                self.end_headers()
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer((host, 0), Handler)
-        self.url = f"http://{host}:{self._server.server_address[1]}/hook"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-
-
 def test_webhook_receivers(scenario, ends_well) -> None:
     """Receivers that answer 500 at first, 410, slowly, and with a redirect to an address that is forbidden."""
 
-    def slowly(_: int) -> tuple[int, dict[str, str]]:
-        time.sleep(1.0)
-        return 200, {}
-
-    forbidden = Receiver("127.0.0.2", lambda n: (200, {}))
+    forbidden = Receiver("127.0.0.2")
     receivers = {
         "stumbling": Receiver("127.0.0.1", lambda n: (500 if n <= 3 else 200, {})),
         "gone": Receiver("127.0.0.1", lambda n: (410, {})),
-        "slow": Receiver("127.0.0.1", slowly),
+        "slow": Receiver("127.0.0.1", slowly(1.0)),
         "redirecting": Receiver("127.0.0.1", lambda n: (302, {"Location": forbidden.url})),
     }
-    service = scenario(webhook_allow="127.0.0.1/32", webhook_http=True, webhook_retry_seconds="0,0.2,0.5,1,2")
+    service = scenario(webhook_retry_seconds="0,0.2,0.5,1,2")
     try:
         service.begin()
         wanted = {"events": ["job.succeeded"]}
@@ -209,7 +176,7 @@ def test_webhook_receivers(scenario, ends_well) -> None:
         service.at_work()
         service.wait()
         for name in ("stumbling", "slow"):
-            wait_until(lambda one=receivers[name]: len(_ids(one)) >= len(service.jobs), f"{name}: not all came", 60)
+            wait_until(lambda one=receivers[name]: len(one.ids) >= len(service.jobs), f"{name}: not all came", 60)
         assert len(receivers["gone"].received) >= 1
         assert service.http.get(f"/v1/webhooks/{made['gone']}").json()["enabled"] is False
         assert not forbidden.received, "the forbidden address was reached"
@@ -219,7 +186,3 @@ def test_webhook_receivers(scenario, ends_well) -> None:
     finally:
         for one in (forbidden, *receivers.values()):
             one.close()
-
-
-def _ids(receiver: Receiver) -> set[str]:
-    return {id for id, _ in receiver.received}

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 from chaoslib.proxy import Rule
 from chaoslib.servers import wait_until
+from chaoslib.workload import CASES
 
 from l3ps_platform.catalog import StageName, StageRow, StageState
 
@@ -142,6 +144,34 @@ def test_database_restarted(scenario, ends_well) -> None:
     service.servers.postgres.start_again()
     ends_well(service)
     assert scenario.facts["failures counted"] == 0  # what ran went on, and leases were borne
+
+
+def test_database_killed_everywhere(scenario, ends_well) -> None:
+    """kill -9 of PostgreSQL in an ingest, in a publish stage and while a client submits jobs; 4 s away each time."""
+    faults = [{"stage": name, "fault": "slow", "seconds": 1.0, "nth": [2]} for name in ("ingest", "publish")]
+    service = scenario(faults=faults, idempotency_lease_seconds=2.0)
+    service.begin(cases=CASES[:12])
+    service.patient = True
+    submitting = threading.Thread(target=lambda: [service.submit(case) for case in CASES[12:] * 2])
+
+    def away() -> None:
+        service.servers.postgres.kill()
+        outlast(AWAY_SECONDS)
+        service.servers.postgres.start_again()
+
+    service.start_worker(concurrency=2)
+    service.at_work("ingest")
+    away()
+    submitting.start()
+    wait_until(lambda: len(service.jobs) > 14, "no job was submitted", 60)
+    away()
+    service.at_work("publish")
+    away()
+    submitting.join(120)
+    service.note_in_flight()
+    ends_well(service)
+    assert len(service.all_jobs()) == len(service.jobs) == 36, "a job was made twice, or not at all"
+    assert scenario.facts["failures counted"] == 0
 
 
 @pytest.fixture

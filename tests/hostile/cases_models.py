@@ -144,6 +144,8 @@ CASES: list[Case] = [
     case("size-huge", _input(height=10**9, width=10**9), JSON, "model.json"),
     case("size-other-than-graph", _input(height=8000, width=8000), GRAPH),
     case("name-leads-out", lambda s: s.model({"name": "../../evil"}), JSON, "model.json"),
+    case("class-of-nul", lambda s: s.model({"classes": ["\0"], "to_nuscenes": {"\0": 4}}), JSON, "model.json"),
+    case("class-of-half-a-pair", lambda s: s.model({"classes": ["\ud800"]}), JSON, "model.json"),
     case("class-outside", lambda s: s.model({"to_nuscenes": {"car": 99, "vegetation": 16, "road": 11}}), JSON, "model"),
     case("classes-too-many", lambda s: s.model({"classes": ["car"] * 999}), f"{GRAPH} {JSON}"),
     case("no-such-output", lambda s: s.model({"output": {"semantic": "none"}}), GRAPH),

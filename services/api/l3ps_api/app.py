@@ -32,6 +32,8 @@ from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
+from l3ps_api.patience import HangUp
+from l3ps_api.places import Places
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
@@ -46,15 +48,20 @@ from l3ps_api.webhooks import service as webhook_service
 from l3ps_api.webhooks.routes import router as webhooks
 from l3ps_platform.catalog import Catalog
 from l3ps_platform.catalog.migrate import upgrade
+from l3ps_platform.chore_metrics import ChoreCollector
 from l3ps_platform.errors import StoreUnavailable
 from l3ps_platform.metrics import CatalogCollector, DiskCollector
 from l3ps_platform.objects import open_store, parse_sources
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
 from l3ps_platform.webhooks import Deliverer
-from l3ps_platform.workflow import Reconciler
+from l3ps_platform.workflow import Reconciler, Sweeper
 
 log = structlog.get_logger(__name__)
+
+ARCHIVES = 16
+"""Archives sent at once: each holds a connection to the store, a manifest (45 MB for 68,000 files) and, while it waits
+for a block, one of the forty threads that answer requests."""
 
 DESCRIPTION = """
 Drive logs in, panoptic labels on every LiDAR point out.
@@ -84,13 +91,18 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.services = services
     app.state.keyring = Keyring(settings, catalog)
-    app.state.events = EventHub(catalog)
+    app.state.events = EventHub(catalog, settings.event_streams)
+    app.state.archives = Places(ARCHIVES, "too-many-archives", "archives", "Wait until one has been downloaded.")
     app.state.registry = CollectorRegistry()
     app.state.registry.register(CatalogCollector(catalog, queue, settings.metrics_jobs))
     app.state.registry.register(DiskCollector(settings))
     ProcessCollector(registry=app.state.registry)
+    app.state.chores = (
+        Reconciler(catalog, queue, settings), Sweeper(catalog, services.store, settings), Deliverer(catalog, settings)
+    )  # fmt: skip
+    app.state.registry.register(ChoreCollector([one.chore for one in app.state.chores]))
     streams = Gauge("l3ps_event_streams", "Open event streams.", registry=app.state.registry)
-    streams.set_function(lambda: app.state.events.listeners)
+    streams.set_function(lambda: app.state.events.places.taken)
     app.state.metrics = Shared(lambda: generate_latest(app.state.registry))
     app.state.readiness = Shared(lambda: check_all(services))
     guarded = [Depends(authenticate)]
@@ -118,6 +130,7 @@ def create_app(settings: Settings) -> FastAPI:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     app.add_middleware(AccessLog)
+    app.add_middleware(HangUp)
     describe(app)
     return app
 
@@ -132,20 +145,18 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     except StoreUnavailable as error:
         log.warning("object store not reached at the start, /readyz tries again", reason=str(error))
     stop = threading.Event()
-    reconciler = Reconciler(services.catalog, services.queue, services.store, services.settings)
-    deliverer = Deliverer(services.catalog, services.settings)
-    chores = [
-        threading.Thread(target=run, args=(stop,), name=name, daemon=True)
-        for name, run in (("reconciler", reconciler.run), ("deliverer", deliverer.run))
+    threads = [
+        threading.Thread(target=worker.run, args=(stop,), name=worker.chore.name, daemon=True)
+        for worker in app.state.chores
     ]
-    for chore in chores:
-        chore.start()
+    for thread in threads:
+        thread.start()
     try:
         yield
     finally:
         stop.set()
         app.state.events.close()
-        for chore in chores:
-            await run_in_threadpool(chore.join, 10)
+        for thread in threads:
+            await run_in_threadpool(thread.join, 10)
         services.catalog.dispose()
         services.queue.close()

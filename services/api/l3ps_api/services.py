@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from l3ps_api.auth import PrincipalDep
 from l3ps_api.jobs.documents import Documents
+from l3ps_api.labels.manifests import Manifests
 from l3ps_platform.catalog import DEFAULT_PROJECT
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.ids import Prefix, is_id
@@ -28,6 +29,7 @@ class Services:
     store: ObjectStore
     queue: Queue
     documents: Documents = field(default_factory=Documents)
+    manifests: Manifests = field(default_factory=Manifests)
 
 
 async def _system(request: Request) -> Services:

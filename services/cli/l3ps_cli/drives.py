@@ -35,6 +35,9 @@ def show(drive: Annotated[str, typer.Argument(help="Id of a drive.")], as_json: 
         done(f"  {scene['name']}: {scene['scans']} scans, {scene['points']} points", as_json=False)
     for problem in document["problems"]:
         out.print(f"  {problem['where']}: {problem['what']}. {problem['remedy']}", style="red", markup=False)
+    more = document.get("problem_count", 0) - len(document["problems"])
+    if more > 0:
+        out.print(f"  … and {more} more.", style="red")
 
 
 @app.command()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import atexit
 import os
 import re
-import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,12 @@ from celery import signals  # noqa: E402
 
 from l3ps_platform import workflow  # noqa: E402
 from l3ps_platform.catalog import Catalog, StageName, stages  # noqa: E402
-from l3ps_platform.errors import PlatformError  # noqa: E402
+from l3ps_platform.errors import CatalogUnavailable, PlatformError  # noqa: E402
 from l3ps_platform.processes import die_with, is_child  # noqa: E402
 from l3ps_platform.queue import TASK_NAMES, Queue, make_app  # noqa: E402
 from l3ps_platform.telemetry import configure_logging  # noqa: E402
 from l3ps_worker import plain_words  # noqa: E402
-from l3ps_worker.context import Context, StopFlag, owner_prefix  # noqa: E402
+from l3ps_worker.context import Context, StopFlag, new_worker  # noqa: E402
 from l3ps_worker.pulse import Pulse  # noqa: E402
 from l3ps_worker.runner import run_stage  # noqa: E402
 from l3ps_worker.scratch import Scratch  # noqa: E402
@@ -42,16 +41,20 @@ app.conf.worker_concurrency = settings.concurrency
 
 _stopping = StopFlag()  # made before the fork, so that the children share it
 _main_pid = os.getpid()
+_worker = new_worker()
+_alive = ExitStack()  # holds the lock by which the worker's successor knows whether it lives
 _context: Context | None = None
 _NO_MEMORY = 77
 """Exit status of a child that ran out of memory."""
+_NOT_RECORDED = 78
+"""Exit status of a child that could not record how its stage ended."""
 
 
 def context() -> Context:
     """This process' context; never inherited through a fork, because connections and sessions do not survive one."""
     global _context  # noqa: PLW0603  (one per process by design)
     if _context is None:
-        _context = Context(settings, _stopping, _main_pid)
+        _context = Context(settings, _stopping, _worker)
     return _context
 
 
@@ -59,12 +62,16 @@ def _run(stage_id: str, attempt: int) -> None:
     """The body of every task."""
     try:
         run_stage(context(), stage_id, attempt)
-    except PlatformError as error:
-        # The catalog is away. The message is spent; the reconciler sends another when the row still says queued.
-        log.warning("stage not recorded", stage=stage_id, reason=str(error))
     except MemoryError:
         # Too little is left even to record it. Celery would take the whole worker down and see the message again.
         os._exit(_NO_MEMORY)
+    except CatalogUnavailable as error:
+        # The worker is told to stop while the catalog is away: the stage's lease runs out, or its message comes again.
+        log.warning("stage not recorded", stage=stage_id, reason=str(error))
+    except Exception:
+        # The row may say that this process is at work on the stage, and while it lives the pulse prolongs its lease.
+        log.exception("stage not recorded, this process ends", stage=stage_id)
+        os._exit(_NOT_RECORDED)
 
 
 for _stage, _task_name in TASK_NAMES.items():
@@ -106,8 +113,8 @@ def _child_lost(args: Any = None, exception: BaseException | None = None, **_: A
     reason, cause = _ending(exception)
     log.warning("child lost", stage=args[0], reason=reason, cause=cause.value)
     retry = workflow.Retry.of(settings)
-    with _briefly() as tx:
-        for stage_id, owner in stages.owned(tx.session, owner_prefix(_main_pid)):
+    with _briefly() as catalog, catalog.transaction() as tx:
+        for stage_id, owner in stages.owned(tx.session, _worker):
             # Given back before the child died, the stage may be in the hands of another one by now. A child beyond
             # the time limit is reported first and then killed.
             dead = isinstance(exception, TimeLimitExceeded) or not is_child(int(owner.rpartition(":")[2]), _main_pid)
@@ -154,36 +161,39 @@ def _begin(**_: Any) -> None:
 
     What a worker held that was killed on this machine is free at once.
     """
-    atexit.register(Pulse(owner_prefix(_main_pid)).stop)
+    atexit.register(Pulse(_worker).stop)
     atexit.register(_give_back_rest)  # the signal worker_shutdown is not sent when SIGQUIT ends the worker
-    Scratch(settings.scratch, settings.scratch_bytes).sweep()
+    scratch = Scratch(settings.scratch, settings.scratch_bytes)
+    scratch.sweep()
+    _alive.enter_context(scratch.alive(_worker))
     retry = workflow.Retry.of(settings)
-    with _briefly() as tx:
-        for stage_id, owner in stages.owned(tx.session, f"{socket.gethostname()}:"):
-            pid = owner.split(":")[-2]
-            if int(pid) == _main_pid or not Path("/proc", pid).exists():
-                workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner)
+    with _briefly() as catalog:
+        for dead in scratch.dead_workers():
+            with catalog.reading() as session:
+                left = stages.owned(session, dead)
+            for stage_id, owner in left:
+                with catalog.transaction() as tx:
+                    workflow.lease_lost(tx, stage_id, retry, owner_prefix=owner)
 
 
 def _give_back_rest() -> None:
     """In the main process at its end: what a child held that was killed in mid-stage by our own shutdown."""
     if os.getpid() != _main_pid:
         return
-    with _briefly() as tx:
-        workflow.release_owned(tx, owner_prefix(_main_pid))
+    with _briefly() as catalog:
+        workflow.release_owned(catalog, _worker)
 
 
 @contextmanager
-def _briefly() -> Iterator[workflow.Transaction]:
-    """A transaction of the main process, on connections that no child may inherit: opened and closed again at once.
+def _briefly() -> Iterator[Catalog]:
+    """A catalog of the main process, whose connections no child may inherit: opened and closed again at once.
 
     A catalog that is away is logged only: leases run out.
     """
     queue = Queue(settings)
     catalog = Catalog(settings.catalog_url, queue.send)
     try:
-        with catalog.transaction() as tx:
-            yield tx
+        yield catalog
     except PlatformError as error:
         log.warning("leases will run out", reason=str(error))
     finally:

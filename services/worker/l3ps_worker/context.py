@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import secrets
 import socket
 from collections import OrderedDict
 from contextlib import suppress
@@ -43,17 +44,17 @@ class Context:
     Args:
         settings: the service's settings.
         stopping: set when the worker is to stop.
-        main_pid: process id of the worker's main process, part of the owner's name in leases.
+        worker: how the names of the worker's owners of leases begin.
     """
 
-    def __init__(self, settings: Settings, stopping: StopFlag | None = None, main_pid: int | None = None) -> None:
+    def __init__(self, settings: Settings, stopping: StopFlag | None = None, worker: str | None = None) -> None:
         self.settings = settings
         self.stopping = stopping or StopFlag()
         self.queue = Queue(settings)
         self.catalog = Catalog(settings.catalog_url, self.queue.send)
         self.store: ObjectStore = open_store(settings)
         self.scratch = Scratch(settings.scratch, settings.scratch_bytes)
-        self.owner = f"{owner_prefix(main_pid or os.getpid())}{os.getpid()}"
+        self.owner = f"{worker or new_worker()}{os.getpid()}"
         self._segmenters: OrderedDict[tuple[str, float, SegmentPreset], Segmenter] = OrderedDict()
 
     def segmenter(self, sha256: str, bundle: Path, min_area: float, look: SegmentPreset) -> Segmenter:
@@ -73,6 +74,10 @@ class Context:
             self.queue.close()
 
 
-def owner_prefix(main_pid: int) -> str:
-    """How the names of all owners below one worker's main process begin."""
-    return f"{socket.gethostname()}:{main_pid}:"
+def new_worker() -> str:
+    """How the names of all owners of leases below this main process begin: never the same twice.
+
+    A container that starts again has the host name and the process ids of before, and a neighbour may have them too:
+    the pulse would go on to prolong what they held.
+    """
+    return f"{socket.gethostname()}:{os.getpid()}:{secrets.token_hex(4)}:"

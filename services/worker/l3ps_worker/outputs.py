@@ -1,13 +1,20 @@
-"""A stage's output, pinned in the catalog before anybody looks whether it is in the store."""
+"""A stage's output: pinned in the catalog before anybody looks whether it is in the store, and looked at as a whole."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
+
+import structlog
 
 from l3ps.progress import Progress
 from l3ps_platform import workflow
-from l3ps_platform.errors import OutputDoomed
+from l3ps_platform.catalog import Json
+from l3ps_platform.errors import CatalogUnavailable, OutputDoomed
+from l3ps_platform.objects import ObjectStore
 from l3ps_worker.context import Context
+
+log = structlog.get_logger(__name__)
 
 _PATIENCE = 30.0
 """Seconds to wait for an output that is being deleted: the sweep takes one round of the reconciler for it."""
@@ -17,6 +24,8 @@ _PAUSE = 0.5
 def pin(context: Context, claim: workflow.Claim, prefix: str, progress: Progress) -> None:
     """Keep an output for the claim's job, whoever else gives it up from now on.
 
+    A catalog that is away is waited for, as at a stage's end: what was computed so far is worth more than the wait.
+
     Args:
         context, claim, progress: as a stage gets them.
         prefix: of the output's objects.
@@ -24,15 +33,32 @@ def pin(context: Context, claim: workflow.Claim, prefix: str, progress: Progress
     Raises:
         OutputDoomed: it is still being deleted; a later attempt makes it anew.
         LeaseLost: the stage is no longer ours.
+        CatalogUnavailable: for as long as a stage waits for one, or the worker is to stop.
     """
-    patience = time.monotonic() + _PATIENCE
+    begun = time.monotonic()
     while True:
         try:
             with context.catalog.transaction() as tx:
                 workflow.pin_output(tx, claim, prefix)
             return
         except OutputDoomed:
-            if time.monotonic() > patience:
+            if time.monotonic() > begun + _PATIENCE:
                 raise
-            progress("wait", 0, 1)
-            time.sleep(_PAUSE)
+        except CatalogUnavailable as error:
+            if time.monotonic() > begun + context.settings.outage_seconds:
+                raise
+            log.warning("output not pinned, trying again", reason=str(error))
+        progress("wait", 0, 1)
+        time.sleep(_PAUSE)
+
+
+def is_whole(store: ObjectStore, prefix: str, files: Iterable[Json]) -> bool:
+    """Whether the files that a scene's manifest names are all in the store, by name and size.
+
+    Args:
+        store: the store.
+        prefix: of the output's objects.
+        files: the manifest's.
+    """
+    found = {info.key: info.size for info in store.list(f"{prefix}/")}
+    return all(found.get(file["key"]) == file["size"] for file in files)

@@ -6,11 +6,14 @@ import hashlib
 import json
 from collections.abc import Iterable
 
+from l3ps.errors import ProcessingError
 from l3ps.evaluate import PanopticEvaluator, mean_estimates
 from l3ps.progress import Progress
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Json, StageName, StageRow, StageState, bundles, jobs, stages
+from l3ps_platform.errors import ObjectMissing
 from l3ps_worker.context import Context
+from l3ps_worker.outputs import is_whole
 from l3ps_worker.work import Done
 
 JOINED = ("poses.txt", "scans.txt")
@@ -30,21 +33,23 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     files: list[Json] = []
     joined = dict.fromkeys(JOINED, b"")
     judged: dict[str, Json] = {}
+    qualities: list[Json | None] = []
     for done, (scene, stage) in enumerate(finished, start=1):
-        scene_manifest = json.loads(context.store.get_bytes(stage.output_key or ""))
+        scene_manifest = _scene_manifest(context, scene.name, stage.output_key or "")
         for file in scene_manifest["files"]:
             if file["path"] in joined:
                 joined[file["path"]] += context.store.get_bytes(file["key"])
             else:
                 files.append({**file, "scene": scene.name})
         judged[scene.name] = {key: scene_manifest.get(key, []) for key in ("estimates", "warnings")}
+        qualities.append(scene_manifest.get("quality", scene.quality))
         progress("publish", done, len(finished))
     for path, data in joined.items():
         key = f"{prefix}/{path}"
         context.store.put_bytes(key, data)
         sha256 = hashlib.sha256(data).hexdigest()
         files.append({"path": path, "format": None, "size": len(data), "sha256": sha256, "key": key})
-    quality = job_quality(scene.quality for scene, _ in finished)
+    quality = job_quality(qualities)
     estimates = mean_estimates(scan for scene in judged.values() for scan in scene["estimates"])
     manifest = {
         "job_id": job.id,
@@ -67,6 +72,18 @@ def publish(context: Context, claim: workflow.Claim, progress: Progress) -> Done
         scans=sum(scene.scans for scene, _ in finished),
         points=sum(scene.points for scene, _ in finished),
     )
+
+
+def _scene_manifest(context: Context, scene: str, key: str) -> Json:
+    """What a scene's refine stage stored. ProcessingError where it is not all there: a retry makes it anew."""
+    try:
+        manifest: Json = json.loads(context.store.get_bytes(key))
+        if is_whole(context.store, key.rpartition("/")[0], manifest["files"]):
+            return manifest
+        context.store.delete(key)  # by it the retry sees what is there
+    except ObjectMissing:
+        pass
+    raise ProcessingError(f"labels of scene {scene!r} are gone from the store: retry the job")
 
 
 def job_quality(scenes: Iterable[Json | None]) -> Json | None:

@@ -4,7 +4,7 @@ It prolongs the leases of the stages that the pool's children hold, as long as t
 goes on with a job that was cancelled, because it is deep in compiled code or waits for a server. A thread in the child
 could not: hdbscan holds the interpreter lock, more than 120 s at a time for 1.8 M points on a busy machine, and a lease
 that runs out under a worker at work costs the whole stage. A child that lives but does not get on is the business of
-the time limit.
+the time limit; one that could not record how its stage ended dies (l3ps_worker.app), so that to live is to be at work.
 """
 
 from __future__ import annotations

@@ -1,9 +1,16 @@
-"""A scene's refined labels, the label files of both sides, poses, and the scene's quality."""
+"""A scene's refined labels, the label files of both sides, poses, and the scene's quality.
+
+The output's key says what was computed, and two machines may round it differently. So the files lie in a folder named
+by a digest of them all: of two workers that compute the same at once, or one that goes on after it was given up, none
+writes into the other's files, and the checksums in whichever ``scene.json`` is last are those of the files it names.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +34,7 @@ from l3ps_platform.objects import segment as key_segment
 from l3ps_worker.arrays import read_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import refine_key
-from l3ps_worker.outputs import pin
-from l3ps_worker.segment import primal_key
+from l3ps_worker.outputs import is_whole, pin
 from l3ps_worker.work import Done, SceneWork, opened_scene, scene_work, sha256_of
 
 log = structlog.get_logger(__name__)
@@ -52,17 +58,18 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
     budget = max(1, context.settings.refine_bytes // BYTES_A_POINT)
     max_points = budget if work.scene.points > budget else None
     wanted = work.job.settings
-    prefix = refine_key(primal_key(work), work.preset, wanted["formats"], wanted["protocol"], max_points)
+    assert work.primal is not None, "a refine stage is queued when its scene's segment stage is done"
+    prefix = refine_key(work.primal, work.preset, wanted["formats"], wanted["protocol"], max_points)
     manifest_key = f"{prefix}/{SCENE_MANIFEST}"
     pin(context, claim, prefix, progress)
-    try:
+    with suppress(ObjectMissing):
         stored: Json = json.loads(context.store.get_bytes(manifest_key))
-        return _done(manifest_key, stored, work, cached=True)
-    except ObjectMissing:
-        pass
+        if is_whole(context.store, prefix, stored["files"]):
+            return _done(manifest_key, stored, work, cached=True)
+        log.warning("labels are not whole in the store, computing them anew", prefix=prefix)
     book = CostBook()
     with opened_scene(context, work, progress) as (drive, scene), context.scratch.workdir() as folder:
-        primal = _primal(context, work, folder)
+        primal = _primal(context, work.primal, folder)
         refined = refine_scene(
             scene,
             primal,
@@ -89,6 +96,8 @@ def refine(context: Context, claim: workflow.Claim, progress: Progress) -> Done:
         "estimates": [estimate.as_dict() for estimate in refined.estimates],
         "warnings": [problem.as_dict() for problem in refined.warnings],
     }
+    # Given up meanwhile, this attempt may have seen its files deleted again: then nothing may vouch for them.
+    pin(context, claim, prefix, progress)
     context.store.put_bytes(manifest_key, json.dumps(manifest, indent=1).encode())
     costs = {**refined.costs, **book.stages}
     steps = {name: (cost.seconds, cost.peak_mb) for name, cost in costs.items()}
@@ -113,11 +122,11 @@ def _done(
     return Done(finish, work.scene.scans, work.scene.points, stored, cached=cached, steps=steps or {})
 
 
-def _primal(context: Context, work: SceneWork, folder: Path) -> list[ScanLabels]:
+def _primal(context: Context, key: str, folder: Path) -> list[ScanLabels]:
     try:
-        context.store.get_file(primal_key(work), folder / "primal.npz")
+        context.store.get_file(key, folder / "primal.npz")
     except ObjectMissing:
-        raise ProcessingError("the scene's primal labels are gone from the store: submit the job again") from None
+        raise ProcessingError("the scene's primal labels are gone from the store: retry the job") from None
     return read_labels(folder / "primal.npz")
 
 
@@ -155,21 +164,20 @@ def _evaluate(
 
 
 def _store(context: Context, prefix: str, out: Path, files: Sequence[WrittenFile], progress: Progress) -> list[Json]:
-    entries: list[Json] = []
-    for done, file in enumerate(files, start=1):
-        path = file.path
-        relative = path.relative_to(out)
-        key = "/".join([prefix, *map(key_segment, relative.parts)])
-        context.store.put_file(key, path)
-        entries.append(
-            {
-                "path": relative.as_posix(),
-                "format": file.format,
-                "scan": file.scan,
-                "size": path.stat().st_size,
-                "sha256": sha256_of(path),
-                "key": key,
-            }
-        )
+    entries: list[Json] = [
+        {
+            "path": file.path.relative_to(out).as_posix(),
+            "format": file.format,
+            "scan": file.scan,
+            "size": file.path.stat().st_size,
+            "sha256": sha256_of(file.path),
+        }
+        for file in files
+    ]
+    contents = "".join(f"{entry['sha256']}  {entry['path']}\n" for entry in entries)
+    folder = f"{prefix}/{hashlib.sha256(contents.encode()).hexdigest()[:16]}"
+    for done, (file, entry) in enumerate(zip(files, entries, strict=True), start=1):
+        entry["key"] = "/".join([folder, *map(key_segment, entry["path"].split("/"))])
+        context.store.put_file(entry["key"], file.path)
         progress("store", done, len(files))
     return entries

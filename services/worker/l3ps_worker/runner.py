@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, TypeVar
 
 import structlog
 
@@ -30,6 +30,7 @@ from l3ps_worker.work import Done
 log = structlog.get_logger(__name__)
 
 Work = Callable[[Context, workflow.Claim, Progress], Done]
+_T = TypeVar("_T")
 Outcome = Literal["done", "failed", "cancelled", "released", "lost", "not-claimed"]
 
 WORK: dict[StageName, tuple[Work, Sequence[str] | Mapping[str, float]]] = {
@@ -43,18 +44,18 @@ WORK: dict[StageName, tuple[Work, Sequence[str] | Mapping[str, float]]] = {
 
 
 def run_stage(context: Context, stage_id: str, attempt: int) -> Outcome:
-    """Claim a stage, do its work and record how it ended. Never raises for what the stage's work does."""
+    """Claim a stage, do its work and record how it ended. Never raises for what the stage's work does.
+
+    Raises:
+        CatalogUnavailable: the catalog is away and the worker is to stop.
+
+    After any exception the row may say that this process still is at work on the stage.
+    """
     with bound(stage=stage_id, attempt=attempt):
-        settings = context.settings
-        with context.catalog.transaction() as tx:
-            claim = workflow.claim(
-                tx,
-                stage_id,
-                attempt,
-                context.owner,
-                lease_seconds=settings.lease_seconds,
-                max_attempts=settings.max_attempts,
-            )
+        lease = context.settings.lease_seconds
+        claim = _patiently(
+            context, lambda tx: workflow.claim(tx, stage_id, attempt, context.owner, lease_seconds=lease)
+        )
         if claim is None:
             log.info("nothing to do for this message")
             return "not-claimed"
@@ -85,38 +86,47 @@ def _run_claimed(context: Context, claim: workflow.Claim) -> Outcome:
         # Also a MemoryError: left to Celery, it takes down the worker's main process and comes back with the message.
         return _failed(context, claim, _error(caught), _cost(book, done))
     cost, finish = _cost(book, done), done.finish
-    _record(context, lambda tx: finish(tx, claim, cost))
+    try:
+        _patiently(context, lambda tx: finish(tx, claim, cost))
+    except (LeaseLost, CatalogUnavailable):
+        raise
+    except Exception as caught:
+        log.error("stage not recorded", exc_info=caught)
+        message = f"what it found could not be recorded ({type(caught).__name__})"
+        return _failed(context, claim, workflow.failure(message, workflow.cause_of(caught)), cost)
     log.info("stage done", seconds=round(cost.seconds, 3), points=cost.points, cached=cost.cached)
     done.afterwards()
     return "done"
 
 
-def _record(context: Context, write: Callable[[workflow.Transaction], None]) -> None:
-    """Write how a stage ended. A catalog that is away is waited for: what was done is worth more than this process.
+def _patiently(context: Context, act: Callable[[workflow.Transaction], _T]) -> _T:
+    """Claim a stage or write how it ended. A catalog that is away is waited for: nobody could claim anything meanwhile.
 
-    Nothing else could be claimed meanwhile either. A worker that is to stop does not wait.
+    What was done is worth more than this process; and where a COMMIT's answer was lost the stage may be ours, which
+    only another try tells. A worker that is to stop does not wait.
     """
-    pause, deadline = 0.1, time.monotonic() + context.settings.outage_seconds
+    pause = 0.1
     while True:
         try:
             with context.catalog.transaction() as tx:
-                return write(tx)
+                result = act(tx)
+            return result
         except CatalogUnavailable as error:
-            if context.stopping.is_set() or time.monotonic() > deadline:
+            if context.stopping.is_set():
                 raise
-            log.warning("outcome not recorded, trying again", reason=str(error))
+            log.warning("waiting for the catalog", reason=str(error))
         time.sleep(pause)
         pause = min(2 * pause, 5.0)
 
 
 def _cancelled(context: Context, claim: workflow.Claim, cost: workflow.Cost) -> Outcome:
-    _record(context, lambda tx: workflow.cancelled(tx, claim, cost))
+    _patiently(context, lambda tx: workflow.cancelled(tx, claim, cost))
     log.info("stage cancelled")
     return "cancelled"
 
 
 def _released(context: Context, claim: workflow.Claim) -> Outcome:
-    _record(context, lambda tx: workflow.release(tx, claim))
+    _patiently(context, lambda tx: workflow.release(tx, claim))
     log.info("stage given back")
     return "released"
 
@@ -126,7 +136,7 @@ def _failed(context: Context, claim: workflow.Claim, error: Json, cost: workflow
     if cause is workflow.Cause.DISK_FULL:
         context.scratch.free()
     retry = None if cause.lasting else workflow.Retry.of(context.settings)
-    _record(context, lambda tx: workflow.fail(tx, claim, error, retry=retry, cost=cost))
+    _patiently(context, lambda tx: workflow.fail(tx, claim, error, retry=retry, cost=cost))
     log.warning("stage failed", reason=error["message"], cause=cause.value)
     return "failed"
 
@@ -153,7 +163,7 @@ def _error(caught: Exception) -> Json:
     cause = workflow.cause_of(caught)
     if isinstance(caught, TrainerLost):
         return workflow.failure(str(caught), workflow.Cause.CRASHED)
-    if cause is workflow.Cause.OUT_OF_MEMORY:
+    if cause is workflow.Cause.OUT_OF_MEMORY and not isinstance(caught, L3psError):
         message = "the worker ran out of memory; use smaller scenes or a worker with more memory"
         return workflow.failure(message, cause)
     if cause is workflow.Cause.DISK_FULL:

@@ -3,6 +3,7 @@
     SCRATCH/cache/<key>/log      an unpacked drive or a model; the key is what it is and its sha256
     SCRATCH/locks/<key>          shared while in use, exclusive while being made or deleted
     SCRATCH/work/<random>/       what a stage is writing; its lock tells the living from the dead
+    SCRATCH/locks/worker-<name>  held by a worker for as long as it lives
 
 Processes agree by ``flock``, which the kernel gives back however a process ends.
 """
@@ -89,11 +90,26 @@ class Scratch:
 
     def sweep(self) -> None:
         """Delete the work folders of dead processes."""
-        for lock_path in self._locks.glob("work-*"):
+        for name in self._abandoned("work-"):
+            shutil.rmtree(self._work / name, ignore_errors=True)
+
+    @contextmanager
+    def alive(self, worker: str) -> Iterator[None]:
+        """While the block runs, and in what was forked in it, the worker of this name counts as alive."""
+        with self._own(self._locks / f"worker-{worker}"):
+            yield
+
+    def dead_workers(self) -> Iterator[str]:
+        """Names of workers that are gone; each is forgotten when the caller goes on to the next."""
+        return self._abandoned("worker-")
+
+    def _abandoned(self, kind: str) -> Iterator[str]:
+        """What this kind of lock is named after, where nobody holds it; it is deleted when the caller goes on."""
+        for lock_path in self._locks.glob(f"{kind}*"):
             try:
                 with lock_path.open("r+b") as lock:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(self._work / lock_path.name.removeprefix("work-"), ignore_errors=True)
+                    yield lock_path.name.removeprefix(kind)
                     lock_path.unlink(missing_ok=True)
             except (BlockingIOError, FileNotFoundError):
                 continue

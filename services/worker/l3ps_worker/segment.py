@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from l3ps.costs import CostBook
 from l3ps.pipeline import primal_labels
 from l3ps.progress import Progress
 from l3ps_platform import workflow
+from l3ps_platform.errors import ObjectMissing
 from l3ps_worker.arrays import write_labels
 from l3ps_worker.context import Context
 from l3ps_worker.keys import segment_key
@@ -19,15 +22,15 @@ def segment(context: Context, claim: workflow.Claim, progress: Progress) -> Done
     key = primal_key(work)
     prefix = key.rpartition("/")[0]
 
-    size: int | None = None
+    size = 0
 
     def finish(tx: workflow.Transaction, claim: workflow.Claim, cost: workflow.Cost) -> None:
         workflow.complete(tx, claim, cost, output_key=key)
-        if size is not None:
-            workflow.note_output(tx, prefix, size)
+        workflow.note_output(tx, prefix, size)
 
     pin(context, claim, prefix, progress)
-    if context.store.exists(key):
+    with suppress(ObjectMissing):
+        size = context.store.stat(key).size  # whoever stored it may have died before noting it
         return Done(finish, work.scene.scans, work.scene.points, cached=True)
     book = CostBook()
     with opened_scene(context, work, progress) as (_, scene), context.scratch.workdir() as folder:

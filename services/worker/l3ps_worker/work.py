@@ -14,7 +14,18 @@ from l3ps.presets import PRESETS, Preset
 from l3ps.progress import Progress
 from l3ps.segment.presets import DEFAULT_SEGMENT, SEGMENT_PRESETS, SegmentPreset
 from l3ps_platform import workflow
-from l3ps_platform.catalog import DriveRow, JobRow, ModelRow, SceneRow, Transaction, bundles, drives, jobs
+from l3ps_platform.catalog import (
+    DriveRow,
+    JobRow,
+    ModelRow,
+    SceneRow,
+    StageName,
+    Transaction,
+    bundles,
+    drives,
+    jobs,
+    stages,
+)
 from l3ps_worker.context import Context
 from l3ps_worker.fetching import as_checked, download, fetch_again
 
@@ -47,12 +58,19 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class SceneWork:
-    """The rows behind a segment or refine stage."""
+    """The rows behind a segment or refine stage.
+
+    Attributes:
+        job, scene, drive, model: the rows.
+        primal: key of the scene's primal labels as its segment stage stored them; None before it has. It names the code
+            that made them, and a refine stage may run on another version.
+    """
 
     job: JobRow
     scene: SceneRow
     drive: DriveRow
     model: ModelRow
+    primal: str | None
 
     @property
     def preset(self) -> Preset:
@@ -84,7 +102,9 @@ def scene_work(context: Context, claim: workflow.Claim) -> SceneWork:
         job = jobs.get(session, claim.job_id)
         scene = session.get_one(SceneRow, claim.scene_id)
         drive = drives.many(session, [job.drive_id])[job.drive_id]
-        return SceneWork(job, scene, drive, bundles.get(session, job.model_id))
+        of_scene = stages.of_scene(session, scene.id)
+        primal = next((stage.output_key for stage in of_scene if stage.name is StageName.SEGMENT), None)
+        return SceneWork(job, scene, drive, bundles.get(session, job.model_id), primal)
 
 
 @contextmanager

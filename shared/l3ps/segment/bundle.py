@@ -19,8 +19,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
+from l3ps.drivelog.archive_names import shown
 from l3ps.errors import ModelError, Problem
 from l3ps.segment.external import PLAIN_NAME, external_tensors
 from l3ps.segment.files import MAX_MODEL_BYTES, BundleFiles, FolderFiles, ZipFiles, bundle_error
@@ -32,6 +33,18 @@ MAX_JSON_BYTES = 1 << 20
 MAX_GRAPH_BYTES = (2 << 30) - 1
 """What a protobuf message can be; larger weights lie in files beside the graph."""
 _DESCRIPTIONS = ("model.json", "about.json")
+_MAX_PROBLEMS = 20
+_MAX_CHARACTERS = 100
+
+
+def _printable(name: str) -> str:
+    # Names go into messages, logs and a database that keeps neither NUL nor half of a UTF-16 pair.
+    if not name or len(name) > _MAX_CHARACTERS or not name.isprintable():
+        raise ValueError(f"a name is 1 to {_MAX_CHARACTERS} printable characters")
+    return name
+
+
+_Name = Annotated[str, AfterValidator(_printable)]
 
 
 class InputSpec(BaseModel):
@@ -39,7 +52,7 @@ class InputSpec(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    name: str
+    name: _Name
     height: int = Field(gt=0, le=8192)
     width: int = Field(gt=0, le=8192)
     range: Literal["0..1", "0..255"] = "0..1"
@@ -58,9 +71,9 @@ class OutputSpec(BaseModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    semantic: str
+    semantic: _Name
     """(1, C, h, w) logits."""
-    boundary: str | None = None
+    boundary: _Name | None = None
     """(1, 1, h, w): probability that a pixel lies inside an object, not on the line between two."""
     boundary_threshold: float = Field(default=0.98, gt=0, lt=1)
     """Below it a pixel counts as boundary; 0.98 is the published value for averaged tilings."""
@@ -85,8 +98,8 @@ class ModelInfo(BaseModel):
     label_space: Literal["nuscenes"] = "nuscenes"
     input: InputSpec
     output: OutputSpec
-    classes: tuple[str, ...] = Field(min_length=1, max_length=1000)
-    to_nuscenes: dict[str, int]
+    classes: tuple[_Name, ...] = Field(min_length=1, max_length=1000)
+    to_nuscenes: dict[_Name, int]
     passes: dict[Annotated[str, Field(pattern=PLAIN_NAME)], PassSpec] = Field(default_factory=dict, max_length=8)
     """Segmentation preset → the graph that it runs, where that is not ``model.onnx``."""
 
@@ -215,7 +228,7 @@ def _parse(text: bytes, where: str) -> ModelInfo:
     except ValidationError as error:
         raise ModelError(
             Problem("bad-model-json", f"{where}/model.json", f"{_path(e['loc'])}: {e['msg']}", "Correct the field.")
-            for e in error.errors()
+            for e in error.errors()[:_MAX_PROBLEMS]
         ) from error
     except (ValueError, RecursionError) as error:
         raise bundle_error("bad-model-json", f"{where}/model.json", f"it is not valid JSON ({error})") from error
@@ -239,4 +252,4 @@ def _add_data(data: dict[str, bytes], files: BundleFiles, name: str, graph: byte
 
 
 def _path(location: tuple[int | str, ...]) -> str:
-    return ".".join(map(str, location)) or "model.json"
+    return ".".join(shown(str(part)) for part in location) or "model.json"

@@ -47,8 +47,10 @@ def limit(memory: int, seconds: float) -> None:
     ):
         hard = resource.getrlimit(kind)[1]
         allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        # Who is out of time gets SIGXCPU at the soft limit, which tells it from who is killed for the machine's memory.
+        most_ever = hard if kind == resource.RLIMIT_CPU else allowed
         with suppress(ValueError, OSError):
-            resource.setrlimit(kind, (allowed, allowed))
+            resource.setrlimit(kind, (allowed, most_ever))
     if sys.platform == "linux":
         with suppress(OSError):
             Path("/proc/self/oom_score_adj").write_text("1000")

@@ -74,7 +74,8 @@ def delete(tx: Transaction, id: str) -> AnnotationsRow:
     return row
 
 
-def leftover_archives(session: Session, limit: int = 100) -> list[AnnotationsRow]:
-    """Deleted ones whose archive is still in the store."""
+def leftover_archives(session: Session, limit: int = 100, after: str = "") -> list[AnnotationsRow]:
+    """Deleted ones whose archive is still in the store, after the id ``after``."""
     gone = (AnnotationsRow.deleted_at.is_not(None), AnnotationsRow.object_key.is_not(None))
-    return list(session.scalars(select(AnnotationsRow).where(*gone).limit(limit)))
+    query = select(AnnotationsRow).where(*gone, AnnotationsRow.id > after).order_by(AnnotationsRow.id)
+    return list(session.scalars(query.limit(limit)))

@@ -77,10 +77,16 @@ def named(session: Session, name: str, project_id: str | None = None) -> ModelRo
 
 
 def by_name(session: Session, name: str, project_id: str | None = None) -> ModelRow:
-    """One model of a project by name, or by id; the project is the session's where none is given. NotFound."""
-    query = select(ModelRow).where(ModelRow.name == name, ModelRow.project_id == project_of(session, project_id))
-    row = session.scalars(query).one_or_none()
-    return row if row is not None else get(session, name)
+    """One model of a project by name, or by id; the project is the session's where none is given. NotFound.
+
+    An id goes before a name: else whoever names a model like another's id would put it in that one's place.
+    """
+    mine = ModelRow.project_id == project_of(session, project_id)
+    rows = session.scalars(select(ModelRow).where(or_(ModelRow.id == name, ModelRow.name == name), mine))
+    found = sorted((row for row in rows if row.deleted_at is None), key=lambda row: row.id != name)
+    if not found:
+        raise NotFound(ModelRow.noun, name)
+    return found[0]
 
 
 def lock(session: Session, id: str) -> ModelRow:
@@ -118,7 +124,8 @@ def delete(tx: Transaction, id: str) -> ModelRow:
     return row
 
 
-def leftover_archives(session: Session, limit: int = 100) -> list[ModelRow]:
-    """Rejected and deleted models whose archive is still in the store."""
+def leftover_archives(session: Session, limit: int = 100, after: str = "") -> list[ModelRow]:
+    """Rejected and deleted models whose archive is still in the store, after the id ``after``."""
     gone = or_(ModelRow.state == ModelState.REJECTED, ModelRow.deleted_at.is_not(None))
-    return list(session.scalars(select(ModelRow).where(gone, ModelRow.object_key.is_not(None)).limit(limit)))
+    query = select(ModelRow).where(gone, ModelRow.object_key.is_not(None), ModelRow.id > after)
+    return list(session.scalars(query.order_by(ModelRow.id).limit(limit)))

@@ -86,7 +86,8 @@ def delete(tx: Transaction, id: str) -> DriveRow:
     return row
 
 
-def leftover_archives(session: Session, limit: int = 100) -> list[DriveRow]:
-    """Rejected and deleted drives whose archive is still in the store."""
+def leftover_archives(session: Session, limit: int = 100, after: str = "") -> list[DriveRow]:
+    """Rejected and deleted drives whose archive is still in the store, after the id ``after``."""
     gone = or_(DriveRow.state == DriveState.REJECTED, DriveRow.deleted_at.is_not(None))
-    return list(session.scalars(select(DriveRow).where(gone, DriveRow.object_key.is_not(None)).limit(limit)))
+    query = select(DriveRow).where(gone, DriveRow.object_key.is_not(None), DriveRow.id > after)
+    return list(session.scalars(query.order_by(DriveRow.id).limit(limit)))

@@ -42,7 +42,8 @@ class WebhookRow(Owned, Base):
     """A URL that is told of events.
 
     ``events``: kinds and groups of them, empty for all. ``previous_secret`` signs too until ``previous_until``.
-    ``failing_since``: the first of the failures since which nothing was delivered.
+    ``failing_since``: the first of the failures since which nothing was delivered. ``attempted_at``: when its last turn
+    began. ``paused_until``: it let the last attempt time out, and is left alone until then.
     """
 
     __tablename__ = "webhooks"
@@ -59,6 +60,8 @@ class WebhookRow(Owned, Base):
     enabled: Mapped[bool] = mapped_column(default=True)
     disabled_reason: Mapped[str | None]
     failing_since: Mapped[datetime | None]
+    attempted_at: Mapped[datetime | None]
+    paused_until: Mapped[datetime | None]
     created_at: Mapped[datetime]
 
 
@@ -72,7 +75,12 @@ class DeliveryRow(Owned, Base):
 
     __tablename__ = "deliveries"
     noun = "delivery"
-    __table_args__ = (Index(None, "webhook_id", "id"), Index(None, "state", "next_at"))
+    __table_args__ = (
+        Index(None, "webhook_id", "id"),
+        Index(None, "webhook_id", "state", "next_at"),
+        Index(None, "state", "next_at"),
+        Index(None, "lease_until"),
+    )
 
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     webhook_id: Mapped[str] = mapped_column(ForeignKey("webhooks.id", ondelete="CASCADE"))

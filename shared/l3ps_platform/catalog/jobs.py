@@ -150,7 +150,7 @@ def delete(tx: Transaction, id: str) -> JobRow:
     return row
 
 
-def unswept(session: Session, limit: int = 20) -> list[JobRow]:
-    """Deleted jobs whose labels are still in the store."""
+def unswept(session: Session, limit: int = 20, after: str = "") -> list[JobRow]:
+    """Deleted jobs whose labels are still in the store, after the id ``after``."""
     query = select(JobRow).where(JobRow.deleted_at.is_not(None), JobRow.swept_at.is_(None))
-    return list(session.scalars(query.order_by(JobRow.deleted_at).limit(limit)))
+    return list(session.scalars(query.where(JobRow.id > after).order_by(JobRow.id).limit(limit)))

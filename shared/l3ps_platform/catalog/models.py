@@ -58,7 +58,8 @@ class UploadRow(Owned, Base):
 class DriveRow(Owned, Base):
     """A drive log.
 
-    ``problem`` is ``{"problems": [Problem.as_dict()…]}``; a ready drive may carry one too: scans that a job can skip.
+    ``problem`` is ``{"problems": [Problem.as_dict()…], "count"}``, the first of very many
+    (l3ps_platform.workflow.problems); a ready drive may carry one too: scans that a job can skip.
     ``info`` once ready: ``{"scenes": [{"name", "scans", "points"}…], "scans", "points", "has_truth", "truth_space"}``,
     counts over the scans a job will label. ``object_key`` is None once the archive is deleted. ``sha256`` is the
     archive file's: the client's claim until the ingest stage has compared it. A drive by reference has a ``source``
@@ -214,7 +215,8 @@ class StageRow(Base):
     ``progress_step`` is what the method is doing (``accumulate``, ``vote`` …), ``progress_done`` and ``progress_total``
     count its units, ``fraction`` (0..1) is over all steps of the stage. ``not_before`` holds back a retry.
     ``attempt`` only rises, so that no late message fits; ``failures`` counts the attempts that failed by a fault of the
-    stage's own, and ``outage_since`` is when what it stands on began to fail it (l3ps_platform.workflow.causes).
+    stage's own, ``losses`` those whose worker went as a whole, and ``outage_seconds`` is how long the stage has waited
+    for what it stands on (l3ps_platform.workflow.retries).
     """
 
     __tablename__ = "stages"
@@ -239,7 +241,8 @@ class StageRow(Base):
     state: Mapped[StageState] = mapped_column(default=StageState.WAITING)
     attempt: Mapped[int] = mapped_column(default=1)
     failures: Mapped[int] = mapped_column(default=0, server_default="0")
-    outage_since: Mapped[datetime | None]
+    losses: Mapped[int] = mapped_column(default=0, server_default="0")
+    outage_seconds: Mapped[float] = mapped_column(default=0.0, server_default="0")
     not_before: Mapped[datetime | None]
     lease_owner: Mapped[str | None]
     lease_until: Mapped[datetime | None]

@@ -77,10 +77,10 @@ def forget_uses(tx: Transaction, *, job_id: str | None = None, training_id: str 
     tx.session.execute(sql_delete(OutputUseRow).where(mine), execution_options={"synchronize_session": False})
 
 
-def doomed(session: Session, limit: int) -> list[OutputRow]:
-    """Outputs that are to be deleted."""
-    query = select(OutputRow).where(OutputRow.state == OutputState.DOOMED).order_by(OutputRow.key)
-    return list(session.scalars(query.limit(limit)))
+def doomed(session: Session, limit: int, after: str = "") -> list[OutputRow]:
+    """Outputs that are to be deleted, after the key ``after``."""
+    query = select(OutputRow).where(OutputRow.state == OutputState.DOOMED, OutputRow.key > after)
+    return list(session.scalars(query.order_by(OutputRow.key).limit(limit)))
 
 
 def erase(tx: Transaction, key: str) -> None:

@@ -9,9 +9,11 @@ from l3ps_platform.catalog.models import JobRow, TrainingRow, UploadRow
 from l3ps_platform.catalog.states import ACTIVE, UploadState
 
 
-def open_uploads(session: Session) -> int:
-    """Uploads that are neither complete nor given up."""
-    return session.scalar(select(func.count()).select_from(UploadRow).where(UploadRow.state == UploadState.OPEN)) or 0
+def open_uploads(session: Session) -> tuple[int, int]:
+    """Uploads that are neither complete nor given up: how many, and the bytes announced."""
+    query = select(func.count(UploadRow.id), func.coalesce(func.sum(UploadRow.size), 0))
+    count, size = session.execute(query.where(UploadRow.state == UploadState.OPEN)).one()
+    return count, int(size)
 
 
 def active_jobs(session: Session) -> int:

@@ -47,6 +47,11 @@ def page(session: Session, *, limit: int = 50, before: str | None = None) -> lis
     return queries.page(session, RuleRow, limit=limit, before=before)
 
 
+def count(session: Session) -> int:
+    """How many there are."""
+    return session.scalar(select(func.count(RuleRow.id))) or 0
+
+
 def of_buckets(session: Session, buckets: Iterable[str]) -> list[RuleRow]:
     """The rules for these buckets."""
     return list(session.scalars(select(RuleRow).where(RuleRow.bucket.in_(set(buckets))).order_by(RuleRow.id)))
@@ -92,10 +97,10 @@ def note(tx: Transaction, found: Sequence[tuple[RuleRow, str, str, str]]) -> lis
     return [id for id in ids if id in kept]
 
 
-def waiting(session: Session, limit: int = 100, without: Collection[str] = ()) -> list[ArrivalRow]:
-    """Arrivals that are no job yet, the oldest first; none of the projects ``without``."""
+def waiting(session: Session, limit: int = 100, *, after: str = "", without: Collection[str] = ()) -> list[ArrivalRow]:
+    """Arrivals that are no job yet, the oldest first, after the id ``after``; none of the projects ``without``."""
     query = select(ArrivalRow).where(ArrivalRow.settled_at.is_(None), ArrivalRow.project_id.not_in(without))
-    return list(session.scalars(query.order_by(ArrivalRow.id).limit(limit)))
+    return list(session.scalars(query.where(ArrivalRow.id > after).order_by(ArrivalRow.id).limit(limit)))
 
 
 def lock_waiting(session: Session, id: str) -> ArrivalRow | None:

@@ -16,15 +16,20 @@ from typing import Any
 import structlog
 from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as NoneFree
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
 from l3ps_platform.catalog.base import Json, Owned
+from l3ps_platform.catalog.clean import clean_json, clean_parameters
 from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.outbox import Happening, write
 from l3ps_platform.catalog.states import QueueName, StageName
 from l3ps_platform.errors import CatalogUnavailable
 
 log = structlog.get_logger(__name__)
+
+# What is too large for PostgreSQL (class 54) stays so for ever, though the driver calls it operational like an outage.
+_TOO_MUCH = "54"
 
 # SQLite allows one writer at a time; ours hold the lock for milliseconds, so half a minute is never a real wait.
 SQLITE_BUSY_MS = 30_000
@@ -124,7 +129,11 @@ class Catalog:
             with self.engine.connect() as connection:
                 yield connection.execution_options(isolation_level="AUTOCOMMIT")
         except (OperationalError, InterfaceError) as error:
+            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
+                raise
             raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+        except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
+            raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
@@ -163,7 +172,11 @@ class Catalog:
                 session.connection(execution_options={"l3ps_write": write})
                 yield session
         except (OperationalError, InterfaceError) as error:
+            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
+                raise
             raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+        except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
+            raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
 
     def now(self, session: Session) -> datetime:
         """The database server's time."""
@@ -210,21 +223,44 @@ def _own_new_rows(session: Session, _context: object, _instances: object) -> Non
 
 # Connections are opened when they are needed and kept. Beyond a smaller pool they would be closed after each use: five
 # bursts of 200 requests opened 55 connections with 5 kept and 10 more allowed, and 15 so.
-_POOL: dict[str, Any] = {"pool_size": 15, "max_overflow": 0}
+_ENGINE: dict[str, Any] = {"pool_size": 15, "max_overflow": 0, "json_serializer": clean_json}
+
+
+# A server that falls silent, because its machine or the way to it is gone, is given up after 25 s; Linux alone would
+# wait for two hours, and with it every lease, retry and request. Unanswered data counts as well as an idle connection.
+_POSTGRESQL: dict[str, Any] = {
+    "connect_timeout": 5,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
 
 
 def make_engine(url: str) -> Engine:
     """An engine with the settings each database needs."""
+    engine = _engine_of(url)
+    event.listen(engine, "before_cursor_execute", _clean_parameters, retval=True)
+    return engine
+
+
+def _engine_of(url: str) -> Engine:
     parsed = make_url(url)
     if parsed.get_backend_name() == "sqlite":
         if parsed.database:
             Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
-        engine = create_engine(url, **_POOL, connect_args={"timeout": SQLITE_BUSY_MS / 1000})
+        engine = create_engine(url, **_ENGINE, connect_args={"timeout": SQLITE_BUSY_MS / 1000})
         event.listen(engine, "connect", _on_sqlite_connect)
         event.listen(engine, "begin", _on_sqlite_begin)
         return engine
     # A pooled connection that died with the server is replaced before use instead of failing the first request.
-    return create_engine(url, pool_pre_ping=True, **_POOL, connect_args={"connect_timeout": 5})
+    return create_engine(url, pool_pre_ping=True, **_ENGINE, connect_args=_POSTGRESQL)
+
+
+def _clean_parameters(
+    _connection: Connection, _cursor: object, statement: str, parameters: Any, _context: object, _many: bool
+) -> tuple[str, Any]:
+    return statement, clean_parameters(parameters)
 
 
 def _on_sqlite_connect(connection: sqlite3.Connection, _record: Any) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 
 from sqlalchemy import case, func, or_, select
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import JobRow, StageRow, StepRow, TrainingRow
-from l3ps_platform.catalog.states import StageName, StageState
+from l3ps_platform.catalog.states import QUEUE_OF, QueueName, StageName, StageState
 from l3ps_platform.errors import NotFound
 
 
@@ -23,6 +24,12 @@ def get(session: Session, id: str) -> StageRow:
 def of_job(session: Session, job_id: str) -> list[StageRow]:
     """All stages of a job, its scenes' and its own, in the order they were planned."""
     return list(session.scalars(select(StageRow).where(StageRow.job_id == job_id).order_by(StageRow.id)))
+
+
+def publishing(session: Session, job_id: str) -> StageRow | None:
+    """The stage that publishes a job, where it has been planned."""
+    query = select(StageRow).where(StageRow.job_id == job_id, StageRow.name == StageName.PUBLISH)
+    return session.scalars(query).one_or_none()
 
 
 def of_job_and_drive(session: Session, job_id: str, drive_id: str) -> list[StageRow]:
@@ -90,6 +97,23 @@ def cancelled_of(session: Session, owner_prefix: str) -> list[tuple[str, str, St
     )
     rows = session.execute(query.with_for_update(of=StageRow))
     return [(id, owner, name) for id, owner, name in rows if owner is not None]
+
+
+def overdue(session: Session, queue: QueueName, before: datetime) -> list[tuple[str, int]]:
+    """(id, attempt) of the stages that have waited in a queue since before then, the longest waiting first."""
+    names = [name for name, where in QUEUE_OF.items() if where is queue]  # the index has names
+    query = select(StageRow.id, StageRow.attempt).where(
+        StageRow.state == StageState.QUEUED, StageRow.name.in_(names), StageRow.queued_at < before
+    )
+    return [(id, attempt) for id, attempt in session.execute(query.order_by(StageRow.queued_at, StageRow.id))]
+
+
+def hold_overdue(session: Session, ids: Sequence[str], before: datetime) -> list[StageRow]:
+    """Those of the stages that still wait since before then, held; none that somebody else holds."""
+    query = select(StageRow).where(
+        StageRow.id.in_(ids), StageRow.state == StageState.QUEUED, StageRow.queued_at < before
+    )
+    return list(session.scalars(query.order_by(StageRow.queued_at, StageRow.id).with_for_update(skip_locked=True)))
 
 
 def steps(session: Session, stage_ids: Sequence[str]) -> dict[str, list[StepRow]]:

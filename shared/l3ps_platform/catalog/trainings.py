@@ -42,9 +42,9 @@ def of_model(session: Session, model_id: str) -> TrainingRow | None:
     return session.scalars(select(TrainingRow).where(TrainingRow.model_id == model_id).limit(1)).one_or_none()
 
 
-def holding_outputs(session: Session, ended_before: datetime, limit: int = 20) -> list[TrainingRow]:
-    """Trainings that ended before then and still hold their outputs in the store."""
+def holding_outputs(session: Session, ended_before: datetime, limit: int = 20, after: str = "") -> list[TrainingRow]:
+    """Trainings that ended before then and still hold their outputs in the store, after the id ``after``."""
     query = select(TrainingRow).join(StageRow, StageRow.training_id == TrainingRow.id)
     query = query.join(OutputUseRow, OutputUseRow.stage_id == StageRow.id)
     query = query.where(TrainingRow.state.not_in(ACTIVE), TrainingRow.finished_at < ended_before).distinct()
-    return list(session.scalars(query.limit(limit)))
+    return list(session.scalars(query.where(TrainingRow.id > after).order_by(TrainingRow.id).limit(limit)))

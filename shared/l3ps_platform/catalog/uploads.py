@@ -80,10 +80,13 @@ def close(tx: Transaction, id: str, state: UploadState, result_id: str | None = 
     return row
 
 
-def leftover(session: Session, limit: int = 100) -> list[UploadRow]:
-    """Aborted uploads whose parts may still be in the store; a clean one has an empty ``s3_upload_id``."""
+def leftover(session: Session, limit: int = 100, after: str = "") -> list[UploadRow]:
+    """Aborted uploads, after the id ``after``, whose parts may still be in the store.
+
+    A clean one has an empty ``s3_upload_id``.
+    """
     query = select(UploadRow).where(UploadRow.state == UploadState.ABORTED, UploadRow.s3_upload_id != "")
-    return list(session.scalars(query.limit(limit)))
+    return list(session.scalars(query.where(UploadRow.id > after).order_by(UploadRow.id).limit(limit)))
 
 
 def expired(session: Session, now: datetime, limit: int = 100) -> list[UploadRow]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
-from sqlalchemy import Select, delete, func, or_, select
+from sqlalchemy import ColumnElement, and_, delete, exists, func, or_, select, update
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import queries
@@ -62,32 +61,77 @@ def deliveries(
     return queries.page(session, DeliveryRow, *conditions, limit=limit, before=before)
 
 
-def failed_since(session: Session, webhook_id: str, since: datetime) -> Sequence[DeliveryRow]:
-    """Failed deliveries of what happened since a date, oldest first."""
-    query = select(DeliveryRow).where(DeliveryRow.webhook_id == webhook_id, DeliveryRow.state == DeliveryState.FAILED)
-    return list(session.scalars(query.where(DeliveryRow.created_at >= since).order_by(DeliveryRow.id)))
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """A webhook that has something to deliver, or to give up because it is off; ``slow`` where it timed out last."""
+
+    id: str
+    project_id: str
+    slow: bool
 
 
-def with_due(session: Session, now: datetime, limit: int = 100) -> list[str]:
-    """Ids of the webhooks that have something to deliver now, the longest waiting first."""
-    query = _due(select(DeliveryRow.webhook_id), now).group_by(DeliveryRow.webhook_id)
-    return list(session.scalars(query.order_by(func.min(DeliveryRow.next_at)).limit(limit)))
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """How many deliveries of a webhook one deliverer is making now."""
+
+    webhook_id: str
+    project_id: str
+    owner: str
+    count: int
+
+
+def waiting(session: Session, now: datetime) -> list[Waiting]:
+    """The webhooks whose turn could come now, the one whose last turn is longest ago first."""
+    row = WebhookRow
+    last = func.coalesce(row.attempted_at, row.created_at)
+    query = select(row.id, row.project_id, row.paused_until).where(*_could_come(now)).order_by(last, row.id)
+    return [Waiting(id, project_id, paused is not None) for id, project_id, paused in session.execute(query)]
+
+
+def any_waiting(session: Session, now: datetime) -> bool:
+    """Whether there is one."""
+    return session.scalar(select(WebhookRow.id).where(*_could_come(now)).limit(1)) is not None
 
 
 def due(session: Session, webhook_id: str, now: datetime, limit: int) -> list[DeliveryRow]:
     """What one webhook is to be sent now, the longest waiting first."""
-    query = _due(select(DeliveryRow), now).where(DeliveryRow.webhook_id == webhook_id)
+    query = select(DeliveryRow).where(DeliveryRow.webhook_id == webhook_id, DeliveryRow.next_at <= now, *_free(now))
     return list(session.scalars(query.order_by(DeliveryRow.next_at, DeliveryRow.id).limit(limit)))
 
 
-def in_flight(session: Session, webhook_ids: Sequence[str], now: datetime) -> dict[str, int]:
-    """How many deliveries of each webhook somebody is making now."""
-    query = select(DeliveryRow.webhook_id, func.count()).where(
-        DeliveryRow.webhook_id.in_(webhook_ids),
-        DeliveryRow.state == DeliveryState.PENDING,
-        DeliveryRow.lease_until >= now,
+def in_flight(session: Session, now: datetime) -> list[Flight]:
+    """What is being delivered now."""
+    row = DeliveryRow
+    query = select(row.webhook_id, row.project_id, row.lease_owner, func.count()).where(
+        row.state == DeliveryState.PENDING, row.lease_until >= now
     )
-    return dict(session.execute(query.group_by(DeliveryRow.webhook_id)).all())
+    found = session.execute(query.group_by(row.webhook_id, row.project_id, row.lease_owner))
+    return [Flight(webhook_id, project_id, owner or "", count) for webhook_id, project_id, owner, count in found]
+
+
+def give_up(session: Session, webhook_id: str, now: datetime, error: str, limit: int) -> int:
+    """Fail what waits for a webhook and nobody holds, the oldest first; how many."""
+    some = select(DeliveryRow.id).where(DeliveryRow.webhook_id == webhook_id, *_free(now)).limit(limit)
+    failed = update(DeliveryRow).where(DeliveryRow.id.in_(some.order_by(DeliveryRow.id)))
+    values = {"state": DeliveryState.FAILED, "last_error": error, "lease_owner": None, "lease_until": None}
+    return len(session.scalars(failed.values(values).returning(DeliveryRow.id)).all())
+
+
+def revive(session: Session, webhook_id: str, now: datetime, since: datetime, after: str, limit: int) -> list[str]:
+    """Have failed deliveries of what happened since a date made again; ids of the next ones after the id ``after``."""
+    row = DeliveryRow
+    some = select(row.id).where(row.webhook_id == webhook_id, row.state == DeliveryState.FAILED)
+    some = some.where(row.created_at >= since, row.lease_owner.is_(None), row.id > after)
+    again = update(row).where(row.id.in_(some.order_by(row.id).limit(limit)))
+    values = {"state": DeliveryState.PENDING, "attempt": 0, "next_at": now, "delivered_at": None}
+    return sorted(session.scalars(again.values(values).returning(row.id)))
+
+
+def forget_deliveries(session: Session, webhook_id: str, limit: int) -> int:
+    """Delete deliveries of a webhook; how many."""
+    some = select(DeliveryRow.id).where(DeliveryRow.webhook_id == webhook_id).limit(limit)
+    gone = delete(DeliveryRow).where(DeliveryRow.id.in_(some)).returning(DeliveryRow.id)
+    return len(session.scalars(gone).all())
 
 
 def prune_deliveries(session: Session, before: datetime) -> None:
@@ -96,6 +140,15 @@ def prune_deliveries(session: Session, before: datetime) -> None:
     session.execute(delete(DeliveryRow).where(*over))
 
 
-def _due(query: Select[Any], now: datetime) -> Select[Any]:
-    free = or_(DeliveryRow.lease_until.is_(None), DeliveryRow.lease_until < now)
-    return query.where(DeliveryRow.state == DeliveryState.PENDING, DeliveryRow.next_at <= now, free)
+def _free(now: datetime) -> tuple[ColumnElement[bool], ...]:
+    unheld = or_(DeliveryRow.lease_until.is_(None), DeliveryRow.lease_until < now)
+    return DeliveryRow.state == DeliveryState.PENDING, unheld
+
+
+def _could_come(now: datetime) -> tuple[ColumnElement[bool], ...]:
+    # A probe of the index for each webhook, and not a look at all that waits, which may be a backlog of days.
+    due = exists().where(DeliveryRow.webhook_id == WebhookRow.id, *_free(now))
+    on = and_(
+        due.where(DeliveryRow.next_at <= now), or_(WebhookRow.paused_until.is_(None), WebhookRow.paused_until <= now)
+    )
+    return (or_(on, and_(WebhookRow.enabled.is_(False), due)),)

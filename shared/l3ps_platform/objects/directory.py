@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from l3ps_platform.errors import ObjectMissing, StoreUnavailable, UploadError
+from l3ps_platform.errors import ObjectMissing, StoreUnavailable
 from l3ps_platform.objects.files import Incoming, append, disk_errors, half_written, to_disk, write_all
 from l3ps_platform.objects.folder_uploads import FolderUploads
 from l3ps_platform.objects.interface import ObjectInfo, Part, Pending
@@ -75,10 +75,10 @@ class DirectoryStore:
             incoming = Incoming(file, grant.size)
             yield incoming
             incoming.check()
-            to_disk(file)
             if grant.upload_id is not None:
-                self._uploads.put(grant.key, grant.upload_id, grant.part or 0, incoming.etag, path)
+                self._uploads.put(grant.key, grant.upload_id, grant.part or 0, incoming.etag, incoming.size, path)
             else:
+                to_disk(file)
                 _move(path, target)
 
     def put_file(self, key: str, path: Path) -> None:
@@ -164,9 +164,9 @@ class DirectoryStore:
         """A URL of the API that stores the body of one PUT."""
         return self.signer.url(Grant("PUT", check_key(key)), seconds)
 
-    def create_multipart(self, key: str) -> str:
+    def create_multipart(self, key: str, part_size: int) -> str:
         """Begin a multipart upload."""
-        return self._uploads.create(check_key(key))
+        return self._uploads.create(check_key(key), part_size)
 
     def presign_part(self, key: str, upload_id: str, number: int, seconds: int, size: int | None = None) -> str:
         """A URL of the API that stores the body of one PUT as a part."""
@@ -184,16 +184,15 @@ class DirectoryStore:
 
     def complete_multipart(self, key: str, upload_id: str, parts: Sequence[Part]) -> ObjectInfo:
         """Join the parts in the order of their numbers."""
-        with self._replacing(self._path(key)) as file:
-            self._uploads.join(key, upload_id, parts, file)
-        self._uploads.drop(upload_id)
+        target = self._path(key)
+        with disk_errors(), self._uploads.joined(key, upload_id, parts) as whole:
+            _move(whole, target)
+        self._uploads.drop(key, upload_id)
         return self.stat(key)
 
     def abort_multipart(self, key: str, upload_id: str) -> None:
         """Drop an upload and its parts."""
-        with suppress(UploadError):
-            self._uploads.check(check_key(key), upload_id)
-            self._uploads.drop(upload_id)
+        self._uploads.drop(check_key(key), upload_id)
 
     def tidy(self, before: datetime) -> int:
         """Delete what processes that died before then were writing."""

@@ -97,8 +97,8 @@ class ObjectStore(Protocol):
     def presign_put(self, key: str, seconds: int) -> str:
         """A URL that stores the body of one PUT."""
 
-    def create_multipart(self, key: str) -> str:
-        """Begin a multipart upload; returns its id."""
+    def create_multipart(self, key: str, part_size: int) -> str:
+        """Begin a multipart upload of parts of ``part_size`` bytes, the last perhaps of fewer; returns its id."""
 
     def presign_part(self, key: str, upload_id: str, number: int, seconds: int, size: int | None = None) -> str:
         """A URL that stores the body of one PUT as part ``number`` (from 1); the reply's ETag names it.

@@ -161,7 +161,7 @@ class S3Store:
     # minio-py has no public face for the steps of a multipart upload; the underscored methods have been stable
     # since 7.0 and the dependency is held below 7.3.
 
-    def create_multipart(self, key: str) -> str:
+    def create_multipart(self, key: str, part_size: int) -> str:
         """Begin a multipart upload."""
         with self._errors(key):
             return self._client._create_multipart_upload(

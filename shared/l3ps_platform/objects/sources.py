@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import BinaryIO, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -87,10 +88,18 @@ class Source:
         project = parse_qs(parts.query).get("project", [None])[0]
         return cls(location, Reference.of(bucket, unquote(path).strip("/")).path, project)
 
-    def covers(self, reference: Reference, project_id: str) -> bool:
-        """Whether a project may read there."""
-        allowed = self.project_id in (None, project_id)
-        return allowed and reference.bucket == self.location.bucket and reference.within(self.path)
+    def covers(self, reference: Reference) -> bool:
+        """Whether a place lies in it."""
+        return reference.bucket == self.location.bucket and reference.within(self.path)
+
+    def lies_in(self, reference: Reference) -> bool:
+        """Whether it lies in a place."""
+        own = Reference(self.location.bucket, self.path)
+        return reference.bucket == own.bucket and own.within(reference.path)
+
+    def admits(self, project_id: str) -> bool:
+        """Whether a project may use it."""
+        return self.project_id in (None, project_id)
 
 
 def parse_sources(text: str) -> tuple[Source, ...]:
@@ -110,11 +119,25 @@ def parse_sources(text: str) -> tuple[Source, ...]:
     return tuple(sources)
 
 
+_parsed = lru_cache(maxsize=1)(parse_sources)
+
+
 def find_source(settings: Settings, reference: Reference, project_id: str) -> Source | None:
-    """The narrowest source through which a project may read a place; None where there is none."""
-    sources = parse_sources(settings.sources.get_secret_value())
-    fitting = [source for source in sources if source.covers(reference, project_id)]
-    return max(fitting, key=lambda source: len(source.path), default=None)
+    """The source through which a project may read a place; None where there is none.
+
+    The narrowest source around a place decides: what is one project's alone is no other's through a wider source, nor
+    as a part of a larger place.
+    """
+    sources = _parsed(settings.sources.get_secret_value())
+    around = [source for source in sources if source.covers(reference)]
+    narrowest = max((len(source.path) for source in around), default=0)
+    deciding = [source for source in around if len(source.path) == narrowest]
+    found = next((source for source in deciding if source.admits(project_id)), None)
+    if found is None:
+        return None
+    inside = [source for source in sources if source.lies_in(reference) and len(source.path) > narrowest]
+    closed = {source.path for source in inside} - {source.path for source in inside if source.admits(project_id)}
+    return None if closed else found
 
 
 class SourceStore:

@@ -26,12 +26,15 @@ from l3ps_platform.webhooks.guard import Guard
 from l3ps_platform.webhooks.schedule import wait_before
 from l3ps_platform.webhooks.sending import Answer, attempt
 from l3ps_platform.workflow import deliveries
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.deliveries import Parcel
 
 log = structlog.get_logger(__name__)
 
-IN_FLIGHT = 8
-"""Attempts at once in this process: a receiver that hangs takes half of them at most."""
+IN_FLIGHT = 16
+"""Attempts at once in this process."""
+SHARE = IN_FLIGHT // 2
+"""Of them, those of one project: however many of its receivers hang, others find room."""
 
 LOOK_SECONDS = 0.5
 """How often the catalog is asked what is due."""
@@ -56,6 +59,7 @@ class Deliverer:
         self._guard = Guard(settings.webhook_allow, http=settings.webhook_http)
         self._owner = f"{socket.gethostname()[:32]}:{os.getpid()}:{secrets.token_hex(4)}"
         self._pruned = float("-inf")
+        self.chore = Chore("deliverer", "take", "deliver", "prune")
 
     def run(self, stop: threading.Event) -> None:
         """Deliver until ``stop`` is set; what is in flight then is given back and made again by whoever comes next."""
@@ -67,16 +71,13 @@ class Deliverer:
         loop.set_default_executor(ThreadPoolExecutor(2 * IN_FLIGHT + 2, "webhooks"))
         flights: dict[asyncio.Task[None], Parcel] = {}
         while not stop.is_set():
-            try:
+            with self.chore.step("take"):
                 for parcel in await asyncio.to_thread(self._take, IN_FLIGHT - len(flights)):
                     flights[asyncio.create_task(self._deliver(parcel))] = parcel
-                if loop.time() - self._pruned > PRUNE_SECONDS:
-                    self._pruned = loop.time()
+            if loop.time() - self._pruned > PRUNE_SECONDS:
+                self._pruned = loop.time()
+                with self.chore.step("prune"):
                     await asyncio.to_thread(self._prune)
-            except PlatformError as error:
-                log.warning("deliverer waits", reason=str(error))
-            except Exception:
-                log.exception("deliverer failed")
             landed = await self._wait(flights)
             for task in landed:
                 del flights[task]
@@ -94,29 +95,27 @@ class Deliverer:
         return done - {pause}
 
     async def _deliver(self, parcel: Parcel) -> None:
-        try:
-            seconds = self._settings.webhook_timeout_seconds
-            answer = await attempt(self._guard, parcel.url, parcel.secrets, parcel.id, parcel.body, seconds)
+        seconds = self._settings.webhook_timeout_seconds
+        answer = await attempt(self._guard, parcel.url, parcel.secrets, parcel.id, parcel.body, seconds)
+        with self.chore.step("deliver"):  # what is not recorded is made again when its lease is over
             await asyncio.to_thread(self._record, parcel, answer)
-        except PlatformError as error:
-            log.warning("delivery not recorded, it will be made again", delivery=parcel.id, reason=str(error))
-        except Exception:
-            log.exception("delivery failed in an unforeseen way", delivery=parcel.id)
 
     def _take(self, limit: int) -> list[Parcel]:
         if limit <= 0:
             return []
         with self._catalog.reading() as session:
-            if not webhooks.with_due(session, self._catalog.now(session), limit=1):
+            if not webhooks.any_waiting(session, self._catalog.now(session)):
                 return []
         lease = self._settings.webhook_timeout_seconds + RECORD_SECONDS
         with self._catalog.transaction() as tx:
-            return deliveries.take(tx, self._owner, limit=limit, lease_seconds=lease)
+            return deliveries.take(tx, self._owner, limit=limit, share=SHARE, lease_seconds=lease)
 
     def _record(self, parcel: Parcel, answer: Answer) -> None:
         settings = self._settings
         wait = wait_before(settings.webhook_retry_seconds, parcel.attempts + 1, answer.retry_after)
-        outcome = deliveries.Attempt(answer.status, answer.error, answer.seconds, again_after=wait, gone=answer.gone)
+        outcome = deliveries.Attempt(
+            answer.status, answer.error, answer.seconds, wait, gone=answer.gone, timed_out=answer.timed_out
+        )
         disable_after = timedelta(days=settings.webhook_disable_days)
         with suppress(NotFound), self._catalog.transaction() as tx:  # its webhook was deleted meanwhile
             deliveries.attempted(tx, parcel, outcome, disable_after=disable_after)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address
 
@@ -72,25 +73,23 @@ class Guard:
         self._resolve = resolver
 
     def admit(self, url: str) -> Target:
-        """The target that a URL names. TargetRefused says why there is none."""
+        """The target that a URL names. TargetRefused says why there is none.
+
+        In the same words for a name that means nothing, nothing public, or nothing that the resolver tells: whoever
+        asks may not learn the names and numbers of the network that the service is in.
+        """
         parsed = self._parse(url)
         port = parsed.port or (443 if parsed.scheme == "https" else 80)
-        try:
+        found: list[Address] = []
+        with suppress(OSError, ValueError):  # which is as good as none
             found = [_plain(ip_address(text)) for text in self._resolve(host_of(parsed), port)]
-        except (OSError, UnicodeError, ValueError):
-            raise TargetRefused(f"the name {parsed.host!r} does not resolve to an address", _OTHER_NAME) from None
         # The same address may come once a protocol; a name with more than a handful has no good reason to.
         addresses = tuple(dict.fromkeys(found))
-        if not addresses or len(addresses) > MAX_ADDRESSES:
-            raise TargetRefused(f"the name {parsed.host!r} resolves to {len(addresses)} addresses", _OTHER_NAME)
-        for address in addresses:
-            if self._allowed(address):
-                continue
-            # The address is not named: whoever asks may not know the network's names and numbers.
-            if not is_public(address):
-                raise TargetRefused(f"{parsed.host!r} is not a public address", _PUBLIC)
-            if port not in HTTP_PORTS and port < FIRST_FREE_PORT:
-                raise TargetRefused(f"port {port} is not one that webhooks are sent to", _PORTS)
+        foreign = [address for address in addresses if not self._allowed(address)]
+        if not 0 < len(addresses) <= MAX_ADDRESSES or not all(map(is_public, foreign)):
+            raise TargetRefused(f"{parsed.host!r} is no public address and no name of one", _PUBLIC)
+        if foreign and port not in HTTP_PORTS and port < FIRST_FREE_PORT:
+            raise TargetRefused(f"port {port} is not one that webhooks are sent to", _PORTS)
         return Target(parsed, addresses)
 
     def _parse(self, url: str) -> httpx.URL:
@@ -98,9 +97,10 @@ class Guard:
             raise TargetRefused(f"the URL has {len(url)} characters", f"Use one of at most {MAX_URL}.")
         try:
             parsed = httpx.URL(url)
+            hostless = not parsed.host  # which decodes "xn--…", or fails to
         except (httpx.InvalidURL, ValueError):
             raise TargetRefused("it is not a URL", "Give an absolute URL such as https://example.com/hook.") from None
-        if parsed.scheme not in ("https", "http") or not parsed.host:
+        if parsed.scheme not in ("https", "http") or hostless:
             raise TargetRefused("it is not a web address", "Give an absolute URL such as https://example.com/hook.")
         if parsed.scheme == "http" and not self._http:
             raise TargetRefused("it is not encrypted", "Use https (L3PS_WEBHOOK_HTTP=1 on the service permits http).")
@@ -114,8 +114,10 @@ class Guard:
         return any(address in network for network in self._allow)
 
 
-_OTHER_NAME = "Use a name that is in the public DNS."
-_PUBLIC = "Use a public address (L3PS_WEBHOOK_ALLOW on the service lists the others that may be called)."
+_PUBLIC = (
+    "Use a name that is in the public DNS, or a public address (L3PS_WEBHOOK_ALLOW on the service lists the others "
+    "that may be called)."
+)
 _PORTS = f"Use port 443, 80, or one from {FIRST_FREE_PORT}."
 
 

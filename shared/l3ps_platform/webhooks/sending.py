@@ -11,18 +11,21 @@ import asyncio
 import ssl
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from importlib.metadata import version
 
 import certifi
 import httpx
+import structlog
 
 from l3ps_platform.errors import TargetRefused
 from l3ps_platform.webhooks import signing
 from l3ps_platform.webhooks.guard import Guard, Target, host_of
 from l3ps_platform.webhooks.schedule import read_retry_after
+
+log = structlog.get_logger(__name__)
 
 MAX_ANSWER = 4096
 MAX_TRIED = 3
@@ -38,12 +41,14 @@ class Answer:
         error: what went wrong, one sentence; None when the receiver took the message.
         retry_after: how long the receiver asks to be left alone.
         seconds: what it took.
+        timed_out: it was given up at the end of its time.
     """
 
     status: int | None = None
     error: str | None = None
     retry_after: timedelta | None = None
     seconds: float = 0.0
+    timed_out: bool = False
 
     @property
     def delivered(self) -> bool:
@@ -66,25 +71,31 @@ async def attempt(guard: Guard, url: str, secrets: Sequence[str], id: str, body:
         id: of the message.
         body: JSON.
         seconds: for everything together, from resolving the name to the end of the answer.
+
+    Returns:
+        How it ended, whatever went wrong: what is not counted as an attempt would be made again for ever.
     """
     start = time.monotonic()
-    headers = {
-        "content-type": "application/json",
-        "accept-encoding": "identity",
-        "user-agent": f"l3ps-webhooks/{version('l3ps-platform')}",
-        **signing.headers(secrets, id, int(time.time()), body),
-    }
     try:
+        headers = {
+            "content-type": "application/json",
+            "accept-encoding": "identity",
+            "user-agent": f"l3ps-webhooks/{version('l3ps-platform')}",
+            **signing.headers(secrets, id, int(time.time()), body),
+        }
         async with asyncio.timeout(seconds):
             target = await asyncio.to_thread(guard.admit, url)
             answer = await _post(target, headers, body, seconds)
     except TargetRefused as refusal:
         answer = Answer(error=f"not sent: {refusal.what}")
-    except TimeoutError:
-        answer = Answer(error=f"no complete answer within {seconds:g} s")
+    except (TimeoutError, httpx.TimeoutException):
+        answer = Answer(error=f"no complete answer within {seconds:g} s", timed_out=True)
     except (httpx.HTTPError, ssl.SSLError, OSError) as error:
         answer = Answer(error=f"{type(error).__name__}: {error}"[:200])
-    return Answer(answer.status, answer.error, answer.retry_after, time.monotonic() - start)
+    except Exception as error:
+        log.exception("delivery failed in an unforeseen way", delivery=id)
+        answer = Answer(error=f"not sent: the service failed ({type(error).__name__})")
+    return replace(answer, seconds=time.monotonic() - start)
 
 
 async def _post(target: Target, headers: Mapping[str, str], body: bytes, seconds: float) -> Answer:

@@ -37,15 +37,16 @@ from l3ps_platform.workflow.planning import (
     accept_model,
     accept_source,
     error_json,
-    problems_of,
     submit_job,
 )
+from l3ps_platform.workflow.problems import MAX_PROBLEMS, problem_count, problems_of
 from l3ps_platform.workflow.reconcile import Reconciler, Report, lease_lost
 from l3ps_platform.workflow.retries import Retry
 from l3ps_platform.workflow.sweep import Sweeper
 from l3ps_platform.workflow.trainings import cancel_training, note_training, submit_training, training_done
 
 __all__ = [
+    "MAX_PROBLEMS",
     "Cause",
     "Claim",
     "Cost",
@@ -76,6 +77,7 @@ __all__ = [
     "note_training",
     "outputs_to_keep",
     "pin_output",
+    "problem_count",
     "problems_of",
     "prolong",
     "release",

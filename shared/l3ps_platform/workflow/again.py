@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 
 from sqlalchemy.orm import Session
@@ -19,10 +20,26 @@ _AGAIN = (JobState.FAILED, JobState.CANCELLED)
 
 
 def outputs_to_keep(session: Session, job_id: str) -> list[str]:
-    """Keys of the outputs that another run of a job goes on from."""
-    scenes = [stage.scene_id for stage in stages.of_job(session, job_id) if stage.scene_id is not None]
-    last = [_last_done(stages.of_scene(session, scene)) for scene in dict.fromkeys(scenes)]
-    return [stage.output_key for stage in last if stage is not None and stage.output_key is not None]
+    """Keys of the outputs that another run of a job goes on from, and that may be gone. NotFound.
+
+    Only of what was read and then failed: its reader may have failed for want of it. Others are taken to be there; a
+    stage that does not find its input fails, and the next retry looks.
+    """
+    if jobs.get(session, job_id).state not in _AGAIN:
+        return []
+    planned = stages.of_job(session, job_id)
+    of_scenes: defaultdict[str, list[StageRow]] = defaultdict(list)
+    for stage in planned:
+        if stage.scene_id is not None:
+            of_scenes[stage.scene_id].append(stage)
+    publication = [stage for stage in planned if stage.scene_id is None]
+    keys = []
+    for own in of_scenes.values():
+        last = _last_done(own)
+        readers = [] if last is None else [*own[own.index(last) + 1 :], *publication]
+        if last is not None and last.output_key is not None and readers[0].state is StageState.FAILED:
+            keys.append(last.output_key)
+    return keys
 
 
 def retry_job(tx: Transaction, job_id: str, gone: Collection[str] = ()) -> JobRow:
@@ -75,6 +92,7 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
         Conflict: it has succeeded or is not over, its name was taken meanwhile, or its annotations are gone.
     """
     training = trainings.get(tx.session, training_id)
+    gone = _hold_annotations(tx, training)
     holder = bundles.named(tx.session, training.name, training.project_id)
     training = trainings.lock(tx.session, training_id)
     if training.state not in _AGAIN:
@@ -84,10 +102,8 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
     under_way = trainings.unfinished(tx.session, training.name)
     if under_way is not None:
         raise Conflict(f"training {under_way.id} is to become model {training.name!r}: wait for it, or cancel it")
-    for id in (training.annotations_id, training.validation_id):
-        given = annotation_sets.lock(tx.session, id) if id is not None else None
-        if given is not None and (given.deleted_at is not None or given.object_key is None):
-            raise Conflict(f"the archive of annotations {id} is gone: upload it again and start a new training")
+    if gone is not None:
+        raise Conflict(f"the archive of annotations {gone} is gone: upload it again and start a new training")
     training.state, training.cancel_requested, training.error = JobState.QUEUED, False, None
     training.started_at = training.finished_at = None
     notices.of_parent(tx, training)
@@ -95,6 +111,17 @@ def retry_training(tx: Transaction, training_id: str) -> TrainingRow:
     _reset(tx, stage)
     enqueue(tx, stage)
     return training
+
+
+def _hold_annotations(tx: Transaction, training: TrainingRow) -> str | None:
+    """Hold what a training learns from, before its model's name, as who starts one does; the first that is gone."""
+    for id in sorted({training.annotations_id, training.validation_id or training.annotations_id}):
+        try:
+            if annotation_sets.lock(tx.session, id).object_key is None:
+                return id
+        except NotFound:
+            return id
+    return None
 
 
 def _last_done(own: Sequence[StageRow]) -> StageRow | None:
@@ -118,8 +145,9 @@ def _reset(tx: Transaction, stage: StageRow) -> None:
     """A stage as when it was planned, but for the number of its attempt."""
     stage.state = StageState.WAITING
     stage.attempt += 1
-    stage.failures = 0
-    stage.outage_since = stage.not_before = stage.finished_at = stage.started_at = None
+    stage.failures = stage.losses = 0
+    stage.outage_seconds = 0.0
+    stage.not_before = stage.finished_at = stage.started_at = None
     stage.error = stage.output_key = stage.progress_step = None
     stage.progress_done = stage.progress_total = 0
     stage.fraction = 0.0

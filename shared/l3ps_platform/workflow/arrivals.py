@@ -10,7 +10,7 @@ from l3ps.errors import InputError
 from l3ps_platform.catalog import quotas, rules
 from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.catalog.source_rows import ArrivalRow
-from l3ps_platform.errors import NotFound
+from l3ps_platform.errors import CatalogUnavailable, NotFound
 from l3ps_platform.workflow.planning import accept_source, error_json, submit_job
 
 log = structlog.get_logger(__name__)
@@ -27,16 +27,15 @@ def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
         seconds: after which the rest is left to the next call.
         max_active: jobs and trainings that a project may have under way.
     """
-    end, count = time.monotonic() + seconds, 0
+    end, count, last = time.monotonic() + seconds, 0, ""
     full: set[str] = set()
-    tried: set[str] = set()
     while True:
         with catalog.reading() as session:
-            found = [row for row in rules.waiting(session, without=full) if row.id not in tried]
+            found = rules.waiting(session, after=last, without=full)
         for arrival in found:
             if time.monotonic() > end:
                 return count
-            tried.add(arrival.id)
+            last = arrival.id
             if arrival.project_id in full:
                 continue
             own = catalog.scoped(arrival.project_id)
@@ -44,7 +43,12 @@ def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
                 if quotas.active_jobs(session) >= max_active:
                     full.add(arrival.project_id)
                     continue
-            count += _settle(own, arrival)
+            try:
+                count += _settle(own, arrival)
+            except CatalogUnavailable:
+                raise
+            except Exception:  # it waits on, and those behind it do not wait for it
+                log.exception("arrival not settled", rule=arrival.rule_id, source=arrival.source)
         if not found:
             return count
 

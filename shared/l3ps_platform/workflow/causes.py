@@ -6,7 +6,7 @@ import errno
 from collections.abc import Iterator
 from enum import StrEnum
 
-from l3ps.errors import Cancelled, InputError, ProcessingError
+from l3ps.errors import Cancelled, InputError, ProcessingError, Starved
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.errors import CatalogUnavailable, LeaseLost, QueueUnavailable, StoreUnavailable
 
@@ -57,6 +57,8 @@ def cause_of(error: BaseException) -> Cause:
     """The cause behind an exception. A full disk counts whatever it is wrapped in."""
     if disk_is_full(error):
         return Cause.DISK_FULL
+    if isinstance(error, Starved):
+        return Cause.OUT_OF_MEMORY if error.lack == "memory" else Cause.TIMEOUT
     for kind, cause in _BY_TYPE:
         if isinstance(error, kind):
             return cause

@@ -3,7 +3,7 @@
 The queue may deliver a message twice, late or never; none of that matters here. Every change of a stage names the
 attempt and the owner it believes in and does nothing when the row disagrees.
 
-Rows are locked in one order everywhere: drive, model, job or training, stage.
+Rows are locked in one order everywhere: annotations, drive, model, job or training, stage.
 """
 
 from __future__ import annotations
@@ -14,17 +14,15 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, cast
 
-from sqlalchemy import CursorResult, Update, select, update
+from sqlalchemy import CursorResult, Update, and_, or_, select, update
 
 from l3ps.errors import Cancelled
 from l3ps_platform.catalog import bundles, drives, jobs, stages, trainings
-from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import DriveState, JobState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost, NotFound
 from l3ps_platform.workflow import notices
-from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
 
 LOST = failure("the worker that ran this stage stopped answering", Cause.LEASE_LOST)
@@ -55,19 +53,19 @@ class Claim:
     training_id: str | None = None
 
 
-def claim(
-    tx: Transaction, stage_id: str, attempt: int, owner: str, *, lease_seconds: float, max_attempts: int
-) -> Claim | None:
+def claim(tx: Transaction, stage_id: str, attempt: int, owner: str, *, lease_seconds: float) -> Claim | None:
     """Take a stage, or None when it is not to be had: taken, finished, cancelled, or the message is an old one.
 
-    A running stage whose lease has run out is taken over; that counts as a failure of its own, so a stage that kills
-    its workers does not go round for ever.
+    An owner may claim again what it already holds: it works on one stage at a time, and so learns whether a claim was
+    committed whose answer was lost. What another one holds is not taken over, its lease run out or not: the reconciler
+    ends such an attempt, counts it and sends the next.
     """
     stage = tx.session.get(StageRow, stage_id)
     if stage is None:
         return None
     parent = lock_parents(tx, stage)
-    if parent is not None and (parent.cancel_requested or parent.state.final):
+    mine = stage.state is StageState.RUNNING and stage.lease_owner == owner
+    if parent is not None and (parent.cancel_requested or parent.state.final) and not mine:
         return None
     lease = {
         "state": StageState.RUNNING,
@@ -79,21 +77,14 @@ def claim(
         "progress_total": 0,
         "fraction": 0.0,
     }
-    mine = (StageRow.id == stage_id, StageRow.attempt == attempt)
-    if changed(tx, update(StageRow).where(*mine, StageRow.state == StageState.QUEUED).values(**lease)):
-        taken = attempt
-    else:
-        abandoned = (StageRow.state == StageState.RUNNING, StageRow.lease_until < tx.now)
-        again = update(StageRow).where(*mine, *abandoned, StageRow.failures + 1 < max_attempts)
-        counted = {"attempt": attempt + 1, "failures": StageRow.failures + 1, "error": LOST}
-        if not changed(tx, again.values(**lease, **counted)):
-            return None
-        note_end(tx, stage, Outcome.LOST, error=LOST)
-        taken = attempt + 1
+    held = and_(StageRow.state == StageState.RUNNING, StageRow.lease_owner == owner)
+    free = (StageRow.id == stage_id, StageRow.attempt == attempt, or_(StageRow.state == StageState.QUEUED, held))
+    if not changed(tx, update(StageRow).where(*free).values(**lease)):
+        return None
     _mark_parents_running(tx, stage, parent)
     return Claim(
         stage_id,
-        taken,
+        attempt,
         owner,
         stage.name,
         lease_seconds,

@@ -12,24 +12,29 @@ from l3ps_platform.catalog.models import DriveRow, JobRow
 from l3ps_platform.catalog.output_rows import RetentionRow
 from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.errors import Conflict, NotFound
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.pins import doom_output
 
 log = structlog.get_logger(__name__)
 
 
-def expire(catalog: Catalog, limit: int) -> int:
+def expire(catalog: Catalog, limit: int, chore: Chore) -> int:
     """Delete the finished jobs and idle drives that are beyond their project's age or size, at most ``limit``.
 
     The oldest go first; what an unfinished job refers to is no candidate. So go the jobs of deleted projects. Returns
-    how many went.
+    how many went. One that fails is the chore's to bear.
     """
     with catalog.reading() as session:
         rules = retention.limited(session)
         ownerless = retention.of_closed_projects(session, limit)
-    count = sum(_delete(catalog, job, "project deleted") for job in ownerless)
+    count = 0
+    for job in ownerless:
+        with chore.row("expired_jobs", job.id):
+            count += _delete(catalog, job, "project deleted")
     for rule in rules:
-        count += _by_age(catalog, rule, limit - count)
-        count += _by_size(catalog, rule, limit - count)
+        for act in (_by_age, _by_size):
+            with chore.row("expired_jobs", rule.project_id):
+                count += act(catalog, rule, limit - count)
     return count
 
 

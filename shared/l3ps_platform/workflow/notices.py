@@ -9,6 +9,7 @@ from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.kinds import EventKind
 from l3ps_platform.catalog.models import DriveRow, JobRow, ModelRow, SceneRow, StageRow, TrainingRow
 from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.workflow.problems import problem_count
 
 
 def of_parent(tx: Transaction, parent: JobRow | TrainingRow) -> None:
@@ -28,7 +29,8 @@ def of_upload(tx: Transaction, row: DriveRow | ModelRow) -> None:
     thing = "drive" if isinstance(row, DriveRow) else "model"
     problems = (row.problem or {}).get("problems", [])
     first = f"{problems[0].get('where')}: {problems[0].get('what')}" if problems else None
-    data: Json = {"id": row.id, "state": row.state.value, "name": row.name, "problems": len(problems), "message": first}
+    count = problem_count(row.problem)
+    data: Json = {"id": row.id, "state": row.state.value, "name": row.name, "problems": count, "message": first}
     tx.emit(EventKind(f"{thing}.{row.state}"), row, _known(data))
 
 

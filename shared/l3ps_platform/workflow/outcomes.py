@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete, update
 
 from l3ps.errors import Problem
 from l3ps_platform.catalog import bundles, drives, jobs, stages
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.base import Json
 from l3ps_platform.catalog.models import JobRow, SceneRow, StageRow, StepRow
-from l3ps_platform.catalog.session import Transaction
+from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.catalog.states import DriveState, ModelState, StageName, StageState
 from l3ps_platform.errors import LeaseLost
 from l3ps_platform.workflow import notices
@@ -20,6 +20,7 @@ from l3ps_platform.workflow.attempts import Cost, note_again, note_end, note_fig
 from l3ps_platform.workflow.causes import Cause, failure
 from l3ps_platform.workflow.claims import Claim, changed, lock_parents, owned
 from l3ps_platform.workflow.planning import enqueue, plan_if_ready
+from l3ps_platform.workflow.problems import kept_problems
 from l3ps_platform.workflow.retries import Retry, next_try
 from l3ps_platform.workflow.settling import cancel_rest_of_scene, settle, settle_job
 
@@ -55,12 +56,14 @@ def complete(
         scene = tx.session.get_one(SceneRow, stage.scene_id)
         if quality is not None:
             scene.quality = quality
-        waiting = [s for s in stages.of_scene(tx.session, scene.id) if s.state is StageState.WAITING]
-        if waiting and not job.cancel_requested:
-            enqueue(tx, waiting[0])
-        elif not waiting:
+        rest = [other for other in stages.of_scene(tx.session, scene.id) if other.state is not StageState.DONE]
+        if not rest:
             scene.state = StageState.DONE
             notices.of_scene(tx, job, scene, stage)
+        elif job.cancel_requested:
+            scene.state = StageState.CANCELLED
+        elif rest[0].state is StageState.WAITING:
+            enqueue(tx, rest[0])
     settle_job(tx, job)
 
 
@@ -80,7 +83,7 @@ def drive_checked(
     stage = finish(tx, claim, StageState.DONE, cost=cost, error=None if usable else _rejection(problems))
     drive = drives.lock(tx.session, _must(stage.drive_id))
     drive.state = DriveState.READY if usable else DriveState.REJECTED
-    drive.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    drive.problem = kept_problems(problems)
     drive.sha256, drive.format, drive.info = sha256, format, info
     drive.size = drive.size if size is None else size
     tx.session.flush()
@@ -101,7 +104,7 @@ def model_checked(
     stage = finish(tx, claim, StageState.DONE, cost=cost, error=_rejection(problems) if problems else None)
     model = bundles.lock(tx.session, _must(stage.model_id))
     model.state = ModelState.REJECTED if problems else ModelState.READY
-    model.problem = {"problems": [p.as_dict() for p in problems]} if problems else None
+    model.problem = kept_problems(problems)
     model.sha256, model.info = sha256, info
     tx.session.flush()
     notices.of_upload(tx, model)
@@ -169,13 +172,18 @@ def release(tx: Transaction, claim: Claim) -> None:
         enqueue(tx, stage)
 
 
-def release_owned(tx: Transaction, owner_prefix: str) -> int:
-    """Give back every stage whose owner's name begins so; how many. For a worker that was made to stop in mid-stage."""
-    mine = StageRow.lease_owner.startswith(owner_prefix, autoescape=True)
+def release_owned(catalog: Catalog, owner_prefix: str) -> int:
+    """Give back every stage whose owner's name begins so; how many. For a worker that was made to stop in mid-stage.
+
+    One transaction for each: workers that stop together hold stages of the same jobs, each in an order of its own.
+    """
+    with catalog.reading() as session:
+        held = stages.owned(session, owner_prefix)
     count = 0
-    for stage in list(tx.session.scalars(select(StageRow).where(StageRow.state == StageState.RUNNING, mine))):
-        with suppress(LeaseLost):
-            release(tx, Claim(stage.id, stage.attempt, stage.lease_owner or "", stage.name, 0.0))
+    for stage_id, owner in held:
+        with suppress(LeaseLost), catalog.transaction() as tx:
+            stage = stages.get(tx.session, stage_id)
+            release(tx, Claim(stage_id, stage.attempt, owner, stage.name, 0.0))
             count += 1
     return count
 
@@ -266,7 +274,7 @@ def _reject_unchecked(tx: Transaction, stage: StageRow) -> None:
         what=f"it could not be checked: {(stage.error or {}).get('message', 'unknown error')}",
         remedy="Upload it again; if that does not help, ask whoever runs the service.",
     )
-    kept = {"problems": [problem.as_dict()]}
+    kept = kept_problems([problem])
     if stage.drive_id is not None:
         drive = drives.lock(tx.session, stage.drive_id)
         drive.state, drive.problem = DriveState.REJECTED, kept

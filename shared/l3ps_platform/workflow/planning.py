@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from l3ps.errors import DriveLogError, InputError, ModelError, Problem
 from l3ps_platform.catalog import bundles, drives
@@ -15,6 +14,7 @@ from l3ps_platform.errors import NotFound
 from l3ps_platform.ids import new_id
 from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.causes import cause_of, failure
+from l3ps_platform.workflow.problems import MAX_PROBLEMS, problems_of
 
 
 def accept_drive(
@@ -159,15 +159,9 @@ def enqueue(tx: Transaction, stage: StageRow) -> None:
 
 
 def error_json(error: BaseException) -> Json:
-    """An error as rows keep it: its sentence, its cause and, for bad input, every problem."""
-    problems = [p.as_dict() for p in error.problems] if isinstance(error, InputError) else []
+    """An error as rows keep it: its sentence, its cause and, for bad input, its first problems."""
+    problems = [p.as_dict() for p in error.problems[:MAX_PROBLEMS]] if isinstance(error, InputError) else []
     return failure(str(error) or type(error).__name__, cause_of(error)) | {"problems": problems}
-
-
-def problems_of(stored: Json | None) -> list[Problem]:
-    """The problems that a row keeps."""
-    found: list[dict[str, Any]] = (stored or {}).get("problems", [])
-    return [Problem(**problem) for problem in found]
 
 
 def _refusal(drive: DriveRow, model: ModelRow, job: JobRow) -> InputError | None:

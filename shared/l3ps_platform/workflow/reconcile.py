@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
@@ -16,19 +17,19 @@ from sqlalchemy import ColumnElement, select, update
 
 from l3ps_platform.catalog.attempt_rows import Outcome
 from l3ps_platform.catalog.models import StageRow
-from l3ps_platform.catalog.session import Catalog, StageMessage, Transaction
-from l3ps_platform.catalog.states import QueueName, StageState
-from l3ps_platform.errors import CatalogUnavailable, PlatformError
-from l3ps_platform.objects import ObjectStore
+from l3ps_platform.catalog.session import Catalog, Transaction
+from l3ps_platform.catalog.states import StageName, StageState
+from l3ps_platform.errors import CatalogUnavailable
 from l3ps_platform.settings import Settings
 from l3ps_platform.workflow.arrivals import settle_arrivals
 from l3ps_platform.workflow.attempts import note_end
 from l3ps_platform.workflow.causes import Cause, failure
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.claims import LOST, changed, lock_parents
 from l3ps_platform.workflow.outcomes import failed
 from l3ps_platform.workflow.planning import enqueue
+from l3ps_platform.workflow.resending import Resender
 from l3ps_platform.workflow.retries import Retry
-from l3ps_platform.workflow.sweep import Sweeper
 
 if TYPE_CHECKING:  # celery takes a third of a second to import, and only senders need it
     from l3ps_platform.queue import Queue
@@ -43,15 +44,10 @@ class Report:
     """How much one round put right."""
 
     expired: int = 0
+    hanging: int = 0
     retried: int = 0
     resent: int = 0
     spent: int = 0
-    uploads: int = 0
-    archives: int = 0
-    expired_jobs: int = 0
-    jobs: int = 0
-    outputs: int = 0
-    orphans: int = 0
     arrivals: int = 0
 
 
@@ -61,44 +57,45 @@ class Reconciler:
     Args:
         catalog: whose sender is ``queue.send``.
         queue: to see which messages are still on their way.
-        store: for the sweep of what nobody needs any more.
         settings: intervals and limits.
     """
 
-    def __init__(self, catalog: Catalog, queue: Queue, store: ObjectStore, settings: Settings) -> None:
+    def __init__(self, catalog: Catalog, queue: Queue, settings: Settings) -> None:
         self._catalog = catalog
         self._queue = queue
         self._settings = settings
-        self._sweeper = Sweeper(catalog, store, settings)
+        self._resender = Resender(catalog, queue, settings)
         self._retry = Retry.of(settings)
         self._leases_count_from = float("-inf")
+        self._steps: dict[str, Callable[[], int]] = {
+            "expired": self._expire_leases,
+            "hanging": self._end_hanging,
+            "retried": self._release_retries,
+            "resent": self._resender.run_once,
+            "spent": self._drop_spent,
+            "arrivals": self._settle_arrivals,
+        }
+        self.chore = Chore("reconciler", *self._steps)
 
     def run(self, stop: threading.Event) -> None:
-        """Rounds until ``stop`` is set; a round that fails is logged and the next one tries again."""
+        """Rounds until ``stop`` is set."""
         self._bear_old_leases()
         while not stop.wait(self._settings.reconcile_seconds):
-            try:
-                report = self.run_once()
-                if report != Report():
-                    log.info("reconciled", **{name: getattr(report, name) for name in Report.__slots__})
-            except CatalogUnavailable as error:
-                self._bear_old_leases()
-                log.warning("reconciler waits", reason=str(error))
-            except PlatformError as error:
-                log.warning("reconciler waits", reason=str(error))
-            except Exception:
-                log.exception("reconciler failed")
+            report = self.run_once()
+            if report != Report():
+                log.info("reconciled", **{name: getattr(report, name) for name in Report.__slots__})
 
     def run_once(self) -> Report:
-        """One round."""
-        return Report(
-            expired=self._expire_leases(),
-            retried=self._release_retries(),
-            resent=self._resend(),
-            spent=self._drop_spent(),
-            arrivals=settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs),
-            **self._sweeper.run_once(),
-        )
+        """One round. A step that fails is tried again in the next one, and keeps no other from its turn."""
+        done: dict[str, int] = {}
+        for name, work in self._steps.items():
+            with self.chore.step(name):
+                try:
+                    done[name] = work()
+                except CatalogUnavailable:
+                    self._bear_old_leases()
+                    raise
+        return Report(**done)
 
     def _bear_old_leases(self) -> None:
         """For a lease's time to come, do not conclude from one that has run out that its worker is gone.
@@ -112,15 +109,31 @@ class Reconciler:
             return 0
         count = 0
         for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
-            with self._catalog.transaction() as tx:
+            with self.chore.row("expired", stage_id), self._catalog.transaction() as tx:
                 count += lease_lost(tx, stage_id, self._retry, expired_before=tx.now)
+        return count
+
+    def _end_hanging(self) -> int:
+        """End what runs beyond its time limit under a lease that goes on: its worker ought to have ended it."""
+        count = 0
+        for training in (True, False):
+            limit = self._settings.train_seconds if training else self._settings.stage_seconds
+            kind = (StageRow.name == StageName.TRAIN) if training else (StageRow.name != StageName.TRAIN)
+            # Two leases later than the worker: by then it has ended the stage, or has lost it.
+            since = self._now() - timedelta(seconds=limit + 2 * self._settings.lease_seconds)
+            reason = f"it ran for more than {limit:.0f} s and its worker did not stop it"
+            for stage_id in self._ids(StageRow.state == StageState.RUNNING, kind, StageRow.started_at < since):
+                with self.chore.row("hanging", stage_id), self._catalog.transaction() as tx:
+                    count += lease_lost(
+                        tx, stage_id, self._retry, started_before=since, reason=reason, cause=Cause.TIMEOUT
+                    )
         return count
 
     def _release_retries(self) -> int:
         count = 0
         waiting = (StageRow.state == StageState.WAITING, StageRow.not_before.is_not(None))
         for stage_id in self._ids(*waiting, StageRow.not_before <= self._now()):
-            with self._catalog.transaction() as tx:
+            with self.chore.row("retried", stage_id), self._catalog.transaction() as tx:
                 stage = tx.session.get(StageRow, stage_id)
                 if stage is None:
                     continue
@@ -131,21 +144,6 @@ class Reconciler:
                     enqueue(tx, stage)
                     count += 1
         return count
-
-    def _resend(self) -> int:
-        """Send again what waits in the catalog and is not in the queue: lost with Redis, or never sent."""
-        stale = self._now() - timedelta(seconds=self._settings.resend_seconds)
-        overdue = self._ids(StageRow.state == StageState.QUEUED, StageRow.queued_at < stale)
-        if not overdue:
-            return 0
-        on_their_way = {pair for name in QueueName for pair in self._queue.pending(name)}
-        with self._catalog.transaction() as tx:
-            query = select(StageRow).where(StageRow.id.in_(overdue), StageRow.state == StageState.QUEUED)
-            for stage in tx.session.scalars(query.with_for_update(skip_locked=True)):
-                if (stage.id, stage.attempt) not in on_their_way:
-                    stage.queued_at = tx.now
-                    tx.outbox.append(StageMessage(stage.id, stage.attempt, stage.name, stage.queue))
-            return len(tx.outbox)
 
     def _drop_spent(self) -> int:
         """Forget messages that a killed worker left delivered for ever, once there is nothing left to do for them."""
@@ -161,6 +159,9 @@ class Reconciler:
         if spent:
             self._queue.drop(spent)
         return len(spent)
+
+    def _settle_arrivals(self) -> int:
+        return settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs)
 
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:
@@ -182,6 +183,7 @@ def lease_lost(
     retry: Retry,
     *,
     expired_before: datetime | None = None,
+    started_before: datetime | None = None,
     owner_prefix: str | None = None,
     reason: str | None = None,
     cause: Cause = Cause.LEASE_LOST,
@@ -193,6 +195,7 @@ def lease_lost(
         stage_id: the stage.
         retry: how often it may be tried.
         expired_before: only if its lease ended before this.
+        started_before: only if it began before this.
         owner_prefix: only if its owner's name begins so (a worker's main process reports its own dead child).
         reason: what to tell the user.
         cause: and in one word.
@@ -204,6 +207,8 @@ def lease_lost(
     conditions = [StageRow.id == stage_id, StageRow.state == StageState.RUNNING]
     if expired_before is not None:
         conditions.append(StageRow.lease_until < expired_before)
+    if started_before is not None:
+        conditions.append(StageRow.started_at < started_before)
     if owner_prefix is not None:
         conditions.append(StageRow.lease_owner.startswith(owner_prefix, autoescape=True))
     error = LOST if reason is None else failure(reason, cause)

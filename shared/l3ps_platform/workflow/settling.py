@@ -10,8 +10,7 @@ from l3ps_platform.catalog.session import Transaction
 from l3ps_platform.catalog.states import JobState, StageName, StageState
 from l3ps_platform.workflow import notices
 from l3ps_platform.workflow.planning import enqueue
-
-MAX_PROBLEMS = 100
+from l3ps_platform.workflow.problems import MAX_PROBLEMS
 
 
 def cancel_rest_of_scene(tx: Transaction, stage: StageRow, scene_state: StageState) -> None:

@@ -6,22 +6,27 @@ something that the next round takes up, and no reader meets half a result.
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import datetime, timedelta
 from itertools import groupby, islice
+from typing import TypeVar
 
 import structlog
 from sqlalchemy import update
+from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog import annotation_sets, belongings, bundles, drives, jobs, outputs, trainings, uploads
-from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, JobRow, ModelRow, UploadRow
+from l3ps_platform.catalog.models import AnnotationsRow, DriveRow, JobRow, ModelRow, TrainingRow, UploadRow
+from l3ps_platform.catalog.output_rows import OutputRow
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.catalog.states import OutputState, StageName, UploadState
-from l3ps_platform.errors import Conflict, StoreError
+from l3ps_platform.errors import Conflict
 from l3ps_platform.objects import ObjectStore
 from l3ps_platform.settings import Settings
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.claims import changed
 from l3ps_platform.workflow.expiry import expire
 from l3ps_platform.workflow.pins import doom_output
@@ -29,7 +34,11 @@ from l3ps_platform.workflow.pins import doom_output
 log = structlog.get_logger(__name__)
 
 BATCH = 100
-"""Outputs deleted, and groups of objects looked at, in one round: the reconciler has other duties."""
+"""Rows, and groups of objects, that a step looks at in one round."""
+PATIENCE = 5
+"""Rows that may fail in one round of a step: what a store refuses may take it half a minute each."""
+
+Row = TypeVar("Row", AnnotationsRow, DriveRow, JobRow, ModelRow, OutputRow, TrainingRow, UploadRow)
 
 
 class Sweeper:
@@ -47,125 +56,156 @@ class Sweeper:
         self._settings = settings
         self._walk: Iterator[tuple[str, datetime]] | None = None
         self._next_walk = 0.0
+        self._after: dict[object, str] = {}
+        self._steps: dict[str, Callable[[], int]] = {
+            "uploads": self._abort_uploads,
+            "archives": self._delete_archives,
+            "expired_jobs": lambda: expire(self._catalog, BATCH, self.chore),
+            "jobs": self._sweep_jobs,
+            "trainings": self._sweep_trainings,
+            "outputs": self._delete_outputs,
+            "orphans": self._sweep_orphans,
+        }
+        self.chore = Chore("sweeper", "round", *self._steps)
+
+    def run(self, stop: threading.Event) -> None:
+        """Rounds until ``stop`` is set."""
+        while not stop.wait(self._settings.reconcile_seconds):
+            report = self.run_once()
+            if any(report.values()):
+                log.info("swept", **report)
 
     def run_once(self) -> dict[str, int]:
-        """One round; how much of each kind went."""
-        with self._catalog.alone("sweep") as mine:
-            if not mine:
-                return {}
-            return {
-                "uploads": self._abort_uploads(),
-                "archives": self._delete_archives(),
-                "expired_jobs": expire(self._catalog, BATCH),
-                "jobs": self._sweep_jobs() + self._sweep_trainings(),
-                "outputs": self._delete_outputs(),
-                "orphans": self._sweep_orphans(),
-            }
+        """One round; how much of each kind went. A step that fails keeps no other from its turn."""
+        done: dict[str, int] = {}
+        with self.chore.step("round"), self._catalog.alone("sweep") as mine:
+            for name, work in self._steps.items() if mine else ():
+                with self.chore.step(name):
+                    done[name] = work()
+        return done
+
+    def _each(self, step: str, find: Callable[..., list[Row]], work: Callable[[Row], object]) -> int:
+        """Do something about the next rows of a step; how many it was done about.
+
+        What failed is passed over until all others had their turn.
+
+        Args:
+            step: the step's name.
+            find: called with ``session``, ``limit`` and ``after``, the id or key of the last row of the round before.
+            work: what to do about a row.
+        """
+        with self._catalog.reading() as session:
+            rows = find(session, limit=BATCH, after=self._after.get(find, ""))
+        count, bearable = 0, self.chore.failures[step] + PATIENCE
+        for row in rows:
+            self._after[find] = row.key if isinstance(row, OutputRow) else row.id
+            with self.chore.row(step, self._after[find]):
+                work(row)
+                count += 1
+            if self.chore.failures[step] >= bearable:
+                return count
+        if len(rows) < BATCH:
+            self._after[find] = ""
+        return count
 
     def _abort_uploads(self) -> int:
         with self._catalog.reading() as session:
             over = uploads.expired(session, self._catalog.now(session))
         for row in over:
-            with self._catalog.transaction() as tx, suppress(Conflict):  # completed in this moment
-                uploads.close(tx, row.id, UploadState.ABORTED)
-        with self._catalog.reading() as session:
-            rows = uploads.leftover(session)
-        for row in rows:
-            self._drop_upload(row)
-            with self._catalog.transaction() as tx:
-                uploads.lock(tx.session, row.id).s3_upload_id = ""
-        return len(rows)
+            with self.chore.row("uploads", row.id), self._catalog.transaction() as tx, suppress(Conflict):
+                uploads.close(tx, row.id, UploadState.ABORTED)  # Conflict: completed in this moment
+        return self._each("uploads", uploads.leftover, self._drop_upload)
 
     def _drop_upload(self, row: UploadRow) -> None:
         self._store.abort_multipart(row.object_key, row.s3_upload_id)
         self._store.delete(row.object_key)  # joined, when the API died before it could say so
+        with self._catalog.transaction() as tx:
+            uploads.lock(tx.session, row.id).s3_upload_id = ""
 
     def _delete_archives(self) -> int:
-        with self._catalog.reading() as session:
-            found: Iterable[AnnotationsRow | DriveRow | ModelRow] = [
-                *annotation_sets.leftover_archives(session),
-                *drives.leftover_archives(session),
-                *bundles.leftover_archives(session),
-            ]
-        count = 0
-        for row in found:
-            key = row.object_key or ""
-            shared = key.startswith("stages/")  # a trained bundle: another training may be about to reuse it
-            if key and not shared:
-                self._store.delete(key)
-            with self._catalog.transaction() as tx:
-                # The row as it is now: it may have been deleted, or given way to another, since it was read.
-                table = type(row)
-                gone = update(table).where(table.id == row.id, table.object_key == row.object_key)
-                changed(tx, gone.values(object_key=None))
-                if shared:
-                    doom_output(tx, belongings.group_of(key))
-                count += 1
-        return count
+        count = self._each("archives", annotation_sets.leftover_archives, self._delete_archive)
+        count += self._each("archives", drives.leftover_archives, self._delete_archive)
+        return count + self._each("archives", bundles.leftover_archives, self._delete_archive)
+
+    def _delete_archive(self, row: AnnotationsRow | DriveRow | ModelRow) -> None:
+        key = row.object_key or ""
+        shared = key.startswith("stages/")  # a trained bundle: another training may be about to reuse it
+        if key and not shared:
+            self._store.delete(key)
+        with self._catalog.transaction() as tx:
+            # The row as it is now: it may have been deleted, or given way to another, since it was read.
+            table = type(row)
+            gone = update(table).where(table.id == row.id, table.object_key == row.object_key)
+            changed(tx, gone.values(object_key=None))
+            if shared:
+                doom_output(tx, belongings.group_of(key))
 
     def _sweep_jobs(self) -> int:
+        return self._each("jobs", jobs.unswept, self._sweep_job)
+
+    def _sweep_job(self, job: JobRow) -> None:
         """Doom what only deleted jobs used, and delete what was theirs alone."""
         with self._catalog.reading() as session:
-            gone = jobs.unswept(session)
-        for job in gone:
-            with self._catalog.reading() as session:
-                used = outputs.of_job(session, job.id)
-            # One output a transaction: nobody waits for more than one row at a time.
-            for key in used:
-                with self._catalog.transaction() as tx:
-                    doom_output(tx, key)
-            self._store.delete(f"jobs/{job.id}/manifest.json")
-            self._store.delete_prefix(f"jobs/{job.id}/")
+            used = outputs.of_job(session, job.id)
+        # One output a transaction: nobody waits for more than one row at a time.
+        for key in used:
             with self._catalog.transaction() as tx:
-                row: JobRow = jobs.lock(tx.session, job.id)
-                row.swept_at = tx.now
-                outputs.forget_uses(tx, job_id=job.id)
-        return len(gone)
+                doom_output(tx, key)
+        self._store.delete(f"jobs/{job.id}/manifest.json")
+        self._store.delete_prefix(f"jobs/{job.id}/")
+        with self._catalog.transaction() as tx:
+            row: JobRow = jobs.lock(tx.session, job.id)
+            row.swept_at = tx.now
+            outputs.forget_uses(tx, job_id=job.id)
 
     def _sweep_trainings(self) -> int:
-        """Delete the checkpoints of trainings that ended long ago; what they made stays while it is a model's."""
+        return self._each("trainings", self._ended_trainings, self._sweep_training)
+
+    def _ended_trainings(self, session: Session, *, limit: int, after: str) -> list[TrainingRow]:
         grace = timedelta(seconds=self._settings.orphan_seconds)
-        with self._catalog.reading() as session:
-            over = trainings.holding_outputs(session, self._catalog.now(session) - grace)
-        for training in over:
-            with self._catalog.transaction() as tx:
-                if not trainings.lock(tx.session, training.id).state.final:  # begun again in this moment
-                    continue
-                used = outputs.of_training(tx.session, training.id)
-                outputs.forget_uses(tx, training_id=training.id)
-                kept = [key for key in used if not doom_output(tx, key)]
-            for key in kept:
-                if self._store.exists(f"{key}/{outputs.MAIN[StageName.TRAIN]}"):
-                    self._store.delete(f"{key}/checkpoint.pt")
-        return len(over)
+        before = self._catalog.now(session) - grace
+        return trainings.holding_outputs(session, before, limit=limit, after=after)
+
+    def _sweep_training(self, training: TrainingRow) -> None:
+        """Delete the checkpoints of a training that ended long ago; what it made stays while it is a model's."""
+        with self._catalog.transaction() as tx:
+            if not trainings.lock(tx.session, training.id).state.final:  # begun again in this moment
+                return
+            used = outputs.of_training(tx.session, training.id)
+            outputs.forget_uses(tx, training_id=training.id)
+            kept = [key for key in used if not doom_output(tx, key)]
+        for key in kept:
+            if self._store.exists(f"{key}/{outputs.MAIN[StageName.TRAIN]}"):
+                self._store.delete(f"{key}/checkpoint.pt")
 
     def _delete_outputs(self) -> int:
-        with self._catalog.reading() as session:
-            rows = outputs.doomed(session, BATCH)
-        for row in rows:
-            if row.stage in outputs.MAIN:
-                self._store.delete(f"{row.key}/{outputs.MAIN[row.stage]}")
-            self._store.delete_prefix(f"{row.key}/")
-            with self._catalog.transaction() as tx:
-                outputs.erase(tx, row.key)
-        return len(rows)
+        return self._each("outputs", outputs.doomed, self._delete_output)
+
+    def _delete_output(self, row: OutputRow) -> None:
+        if row.stage in outputs.MAIN:
+            self._store.delete(f"{row.key}/{outputs.MAIN[row.stage]}")
+        self._store.delete_prefix(f"{row.key}/")
+        with self._catalog.transaction() as tx:
+            outputs.erase(tx, row.key)
 
     def _sweep_orphans(self) -> int:
         """Look at the next objects of the store; what belongs to no row and is old goes."""
         if self._walk is None:
             if time.monotonic() < self._next_walk:
                 return 0
-            self._drop_unknown_uploads()
+            with self.chore.row("orphans", "uploads"):
+                self._drop_unknown_uploads()
             self._walk = self._groups()
-        try:
-            groups = list(islice(self._walk, BATCH))
-            count = sum(self._drop_orphan(group, newest) for group, newest in groups)
-        except StoreError:
-            self._walk = None
-            raise
+        walk, self._walk = self._walk, None  # from the beginning again, if the store does not list its objects
+        groups = list(islice(walk, BATCH))
+        count = 0
+        for group, newest in groups:
+            with self.chore.row("orphans", group):
+                count += self._drop_orphan(group, newest)
         if len(groups) < BATCH:
-            self._walk = None
             self._next_walk = time.monotonic() + self._settings.orphans_every_seconds
+        else:
+            self._walk = walk
         return count
 
     def _groups(self) -> Iterator[tuple[str, datetime]]:
@@ -200,5 +240,6 @@ class Sweeper:
             pending = [one for one in self._store.list_multipart() if one.begun < before]
             unknown = [one for one in pending if not belongings.open_upload(session, one.key, one.upload_id)]
         for one in unknown:
-            self._store.abort_multipart(one.key, one.upload_id)
+            with self.chore.row("orphans", one.key):
+                self._store.abort_multipart(one.key, one.upload_id)
         self._store.tidy(now - timedelta(seconds=self._settings.orphan_seconds))

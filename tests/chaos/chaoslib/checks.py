@@ -6,19 +6,13 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
+from sqlalchemy import or_
+
+from chaoslib import belongings, told
 from chaoslib.servers import wait_until
 from chaoslib.stack import Service
 from chaoslib.workload import Case
-from l3ps_platform.catalog import (
-    DriveRow,
-    JobState,
-    ModelRow,
-    StageName,
-    StageRow,
-    StageState,
-    UploadState,
-)
-from l3ps_platform.catalog.models import UploadRow
+from l3ps_platform.catalog import JobState, SceneRow, StageName, StageRow, StageState
 
 Labels = dict[str, str]
 """sha256 of every label file by its path."""
@@ -44,13 +38,16 @@ def check(service: Service, baseline: Mapping[Case, Labels], expected: Mapping[s
         expected: the jobs that do not succeed.
     """
     states = service.states()
+    deleted = {job.id for job in service.all_jobs() if job.deleted_at is not None}
     for job, case in service.jobs.items():
         assert states[job] is expected.get(job, JobState.SUCCEEDED), (job, str(case), service.job(job).error)
-        if states[job] is JobState.SUCCEEDED:
+        if states[job] is JobState.SUCCEEDED and job not in deleted:
             assert labels(service, job) == baseline[case], f"{job}: other labels than undisturbed: {case}"
-    _done_once(service, states)
+    _done_once(service, states, deleted)
+    _scenes_agree(service, states)
     _nothing_held(service)
-    _no_orphans(service, states)
+    told.check(service)
+    belongings.check(service)
     stages = service.stages()
     service.note("jobs", len(states))
     service.note("jobs by state", dict(Counter(state.value for state in states.values())))
@@ -80,7 +77,7 @@ def gone(service: Service) -> None:
     assert not half, f"half-made entries in the scratch: {half}"
 
 
-def _done_once(service: Service, states: Mapping[str, JobState]) -> None:
+def _done_once(service: Service, states: Mapping[str, JobState], deleted: set[str]) -> None:
     stages = service.stages(StageRow.job_id.is_not(None))
     planned = Counter((stage.job_id, stage.scene_id, stage.name) for stage in stages)
     assert set(planned.values()) <= {1}, "a stage was planned twice"
@@ -89,34 +86,28 @@ def _done_once(service: Service, states: Mapping[str, JobState]) -> None:
             assert stage.state is StageState.DONE, (stage.id, stage.state, stage.error)
     manifests = {job for job in states if service.store.exists(f"jobs/{job}/manifest.json")}
     published = {stage.job_id for stage in stages if stage.name is StageName.PUBLISH and stage.state is StageState.DONE}
+    published -= deleted
     assert manifests == published, f"manifests of {manifests - published}, none of {published - manifests}"
 
 
+def _scenes_agree(service: Service, states: Mapping[str, JobState]) -> None:
+    """A scene is done if and only if each of its stages is, and none goes on when its job is over."""
+    stages: dict[str, set[StageState]] = {}
+    for stage in service.stages(StageRow.scene_id.is_not(None)):
+        stages.setdefault(stage.scene_id or "", set()).add(stage.state)
+    for scene in service.rows(SceneRow):
+        found = (scene.id, scene.state, stages[scene.id], states[scene.job_id])
+        assert scene.state.final, found
+        assert (scene.state is StageState.DONE) == (stages[scene.id] == {StageState.DONE}), found
+        assert (scene.state is StageState.FAILED) == (StageState.FAILED in stages[scene.id]), found
+        if states[scene.job_id] is JobState.SUCCEEDED:
+            assert scene.state is StageState.DONE, found
+
+
 def _nothing_held(service: Service) -> None:
-    held = service.stages(StageRow.lease_owner.is_not(None))
-    assert not held, f"leases left: {[stage.id for stage in held]}"
+    held = service.stages(
+        or_(StageRow.lease_owner.is_not(None), StageRow.lease_until.is_not(None), StageRow.state == StageState.RUNNING)
+    )
+    assert not held, f"stages held or running: {[(stage.id, stage.state) for stage in held]}"
     # Workers acknowledge a message after its row is written, and drop the copies that were sent meanwhile.
-    wait_until(lambda: not service.servers.redis.left(), f"messages left: {service.servers.redis.left()}", 20)
-
-
-def _no_orphans(service: Service, states: Mapping[str, JobState]) -> None:
-    assert not service.servers.minio.multipart_uploads(), "multipart uploads left"
-    from sqlalchemy import select
-
-    with service.catalog.reading() as session:
-        kept = set(session.scalars(select(DriveRow.object_key))) | set(session.scalars(select(ModelRow.object_key)))
-        open_uploads = list(session.scalars(select(UploadRow.id).where(UploadRow.state == UploadState.OPEN)))
-    assert not open_uploads, f"uploads left open: {open_uploads}"
-    for stage in service.stages(StageRow.output_key.is_not(None)):
-        assert stage.output_key is not None
-        kept.add(stage.output_key)
-        if stage.name in (StageName.REFINE, StageName.PUBLISH):
-            kept |= {file["key"] for file in json.loads(service.store.get_bytes(stage.output_key))["files"]}
-    orphans = {info.key for info in service.store.list()} - kept
-    # A stage that was cancelled or failed may have stored some of its outputs; those are for the sweeper, by age.
-    swept = {key for key in orphans if key.startswith("stages/")}
-    unfinished = [state for state in states.values() if state is not JobState.SUCCEEDED]
-    assert not orphans - swept, f"objects without a row: {sorted(orphans - swept)}"
-    assert not swept or unfinished, f"outputs without a row though every job succeeded: {sorted(swept)}"
-    if swept:
-        service.note("objects left to the sweeper", len(swept))
+    wait_until(lambda: not service.messages_left(), f"messages left: {service.messages_left()}", 20)

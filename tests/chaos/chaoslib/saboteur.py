@@ -3,6 +3,9 @@
 ``CHAOS_FAULTS`` is a JSON list of ``{"stage", "fault", "nth", "scene", "when", "seconds"}``. Faults happen in the
 stages' processes, around the real work; which run of a stage it is, is counted over all processes by files in
 ``CHAOS_FOLDER``, where each run also leaves a line: what ran, and how often. A file ``disarmed`` there ends all faults.
+
+``CHAOS_POINTS`` has processes die at points instead (:mod:`chaoslib.points`). ``CHAOS_RELEASE`` makes it another
+release, whose code for every stage is another.
 """
 
 import ctypes
@@ -14,8 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from celery import signals
+
+from chaoslib import points
 from l3ps_platform.catalog import SceneRow, StageName
-from l3ps_worker import runner
+from l3ps_worker import keys, runner
 from l3ps_worker.app import app
 
 __all__ = ["app"]
@@ -103,3 +109,35 @@ def sabotaged(name: StageName, work: Callable[..., Any]) -> Callable[..., Any]:
 
 for _name, (_work, _steps) in list(runner.WORK.items()):
     runner.WORK[_name] = (sabotaged(_name, _work), _steps)
+
+
+_main_pid = os.getpid()
+
+
+def whose_life() -> str | None:
+    """The main process' own, or that of the task at work in a child."""
+    return "main" if os.getpid() == _main_pid else points.task()
+
+
+@signals.task_prerun.connect
+def _begin(sender: Any = None, args: Any = (), **_: Any) -> None:
+    points.begin(sender.name.removeprefix("l3ps."), args[0])
+
+
+@signals.task_postrun.connect
+def _end(**_: Any) -> None:
+    points.begin()
+
+
+points.live(whose_life)
+points.arm()
+
+
+def release(name: str) -> None:
+    """Have every digest of the code say that this is another release."""
+    code = keys.code_version
+    keys.code_version = lambda parts=(): f"{name}-{code(parts)}"  # type: ignore[assignment]
+
+
+if os.environ.get("CHAOS_RELEASE"):
+    release(os.environ["CHAOS_RELEASE"])

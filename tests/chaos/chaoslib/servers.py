@@ -9,8 +9,9 @@ import subprocess
 import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psycopg
@@ -56,6 +57,13 @@ class Server(ABC):
         os.kill(self.process.pid, signal.SIGKILL)
         wait_until(lambda: self.process and not self.process.running(), "it survived SIGKILL")
 
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """It answers nothing and refuses nothing: no process of it runs, and the kernel takes what is sent to it."""
+        assert self.process is not None
+        with silenced(self.process.pid):
+            yield
+
     def stop(self) -> None:
         if self.process is not None:
             self.process.stop()
@@ -93,8 +101,13 @@ class Redis(Server):
     def left(self) -> dict[str, int]:
         """Messages in its queues, and those that were delivered and not acknowledged."""
         with redis.Redis(port=self.port) as client:
-            found = {name: client.llen(name) for name in ("segment", "refine", "train")}
-            return {name: count for name, count in (found | {"unacked": client.hlen("unacked")}).items() if count}
+            return left(client)
+
+
+def left(client: redis.Redis) -> dict[str, int]:
+    """Messages in the queues, and those that were delivered and not acknowledged."""
+    found = {name: client.llen(name) for name in ("segment", "refine", "train")}
+    return {name: count for name, count in (found | {"unacked": client.hlen("unacked")}).items() if count}
 
 
 class Minio(Server):
@@ -156,6 +169,14 @@ class Postgres:
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: not Path(f"/proc/{pid}").exists() or _zombie(pid), "PostgreSQL did not die")
 
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """See :meth:`Server.silent`."""
+        pid = self.server.get_pid()
+        assert pid is not None
+        with silenced(pid):
+            yield
+
     def start_again(self) -> None:
         def started() -> bool:
             try:
@@ -181,6 +202,36 @@ def wait_until(
         assert time.monotonic() < deadline, otherwise
         time.sleep(pause)
     return found
+
+
+@contextmanager
+def silenced(pid: int) -> Iterator[None]:
+    """SIGSTOP to a process and all below it, and SIGCONT at the end."""
+    family = [pid, *descendants(pid)]
+    _signal(family, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        _signal([*family, *descendants(pid)], signal.SIGCONT)
+
+
+def descendants(pid: int) -> list[int]:
+    """The processes below one, parents before their children."""
+    below: dict[int, list[int]] = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parent = int(path.read_text().rpartition(")")[2].split()[1])
+            below.setdefault(parent, []).append(int(path.parent.name))
+    found, level = [], [pid]
+    while level := [child for one in level for child in below.get(one, [])]:
+        found += level
+    return found
+
+
+def _signal(pids: list[int], number: signal.Signals) -> None:
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
 
 
 def _zombie(pid: int) -> bool:

@@ -1,5 +1,6 @@
 """Small jobs: a few simulated drives, a network that tells classes by colour, every preset and format."""
 
+import io
 import json
 import shutil
 import zipfile
@@ -40,13 +41,15 @@ class Workload:
     drives: list[bytes]
     long_drive: bytes
     model: bytes
+    annotations: bytes
 
 
 def make(folder: Path) -> Workload:
     """Simulate the drives and build the network; what is in the folder already is taken."""
     folder.mkdir(parents=True, exist_ok=True)
     drives = [drive(folder / f"drive-{n}", scenes=1, scans=2, seed=n + 1) for n in range(DRIVES)]
-    return Workload(drives, drive(folder / "long", scenes=POISON_SCENES, scans=1, seed=99), _model(folder / "m.zip"))
+    long_drive = drive(folder / "long", scenes=POISON_SCENES, scans=1, seed=99)
+    return Workload(drives, long_drive, _model(folder / "m.zip"), _annotations())
 
 
 def drive(folder: Path, **simulation: int) -> bytes:
@@ -57,6 +60,27 @@ def drive(folder: Path, **simulation: int) -> bytes:
         shutil.make_archive(str(folder), "zip", folder)
         shutil.rmtree(folder)
     return archive.read_bytes()
+
+
+def _annotations() -> bytes:
+    """Four annotated pictures: trees over a road, a bright car somewhere on it."""
+    from PIL import Image
+
+    trees, road, car = 16, 11, 4
+    rng, out = np.random.default_rng(4), io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for number in range(4):
+            semantic = np.full((64, 96), trees, np.uint8)
+            semantic[32:] = road
+            row, column = rng.integers(28, 44), rng.integers(4, 70)
+            semantic[row : row + 12, column : column + 20] = car
+            colours = np.zeros((256, 3), np.uint8)
+            colours[[trees, road, car]] = (20, 120, 20), (90, 90, 90), (240, 240, 250)
+            picture = (colours[semantic] + rng.integers(-12, 13, (64, 96, 3))).clip(0, 255).astype(np.uint8)
+            for folder, image in (("images", picture), ("semantic", semantic)):
+                with archive.open(zipfile.ZipInfo(f"{folder}/{number}.png"), "w") as file:
+                    Image.fromarray(image).save(file, "PNG")
+    return out.getvalue()
 
 
 def _model(path: Path) -> bytes:

@@ -326,7 +326,7 @@ class Played:
         """Claim the next stage that waits for a worker."""
         with self.catalog.transaction() as tx:
             stage = next(row for row in stages.of_job(tx.session, self.id) if row.state is StageState.QUEUED)
-            claim = workflow.claim(tx, stage.id, stage.attempt, "test", lease_seconds=600, max_attempts=3)
+            claim = workflow.claim(tx, stage.id, stage.attempt, "test", lease_seconds=600)
         assert claim is not None
         return claim
 

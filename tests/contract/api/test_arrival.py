@@ -19,6 +19,8 @@ from sqlalchemy import select
 from tests.conftest import free_port, healthy, running
 from tests.contract.api.conftest import Service
 
+from l3ps_api.notifications.service import MAX_ARRIVALS
+from l3ps_api.rules.service import MAX_RULES
 from l3ps_platform import workflow
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, DriveRow, JobRow, ModelState, bundles
 
@@ -202,6 +204,17 @@ def test_a_large_batch_is_answered_at_once_and_all_of_it_becomes_jobs(api):
 
     wanted = sorted(f"s3://fleet/logs/many/{number}.zip" for number in range(200))
     _until(lambda: [source for source in api.sources() if "/many/" in source] == wanted)
+
+
+def test_rules_and_what_meets_them_at_once_are_bounded(api):
+    for _ in range(MAX_RULES):
+        assert api.rule(prefix="logs/bounded").status_code == 201
+    Service.refused(api.rule(prefix="logs/bounded"), 409, "too-many-rules")
+    before = api.sources()
+    batch = {"Records": [record(f"logs/bounded/{n}.zip") for n in range(MAX_ARRIVALS // MAX_RULES + 1)]}
+    document = Service.refused(api.http.post("/v1/notifications/s3", json=batch), 413, "too-large")
+    assert document["errors"][0]["where"] == "Records"
+    assert api.sources() == before, "and none of them became a job"
 
 
 def test_an_arrival_that_can_be_no_job_says_why(api):

@@ -2,18 +2,18 @@
 
 import asyncio
 import shutil
+import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 from sqlalchemy import event
 
+from l3ps_api import patience
 from l3ps_api.events import hub as hub_module
 from l3ps_api.events import stream as stream_module
 from l3ps_api.events.hub import Entry, EventHub
-from l3ps_api.events.service import admit
 from l3ps_api.events.stream import EventStream, Feed, told
-from l3ps_api.problems import ApiProblem
 from l3ps_platform.catalog import DEFAULT_PROJECT, Catalog, DriveState, drives, events
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.workflow import notices
@@ -192,21 +192,30 @@ def test_a_stream_ends_when_the_log_cannot_be_read(catalog, tmp_path) -> None:
     asyncio.run(play())
 
 
-def test_there_is_an_end_to_the_number_of_streams(catalog) -> None:
+def test_a_stream_holds_its_opening_no_longer_than_it_takes_to_send(catalog, monkeypatch) -> None:
+    """A job's snapshot may have 2 MB, and 500 streams live 15 minutes each."""
+    monkeypatch.setattr(stream_module, "HEARTBEAT_SECONDS", 0.05)
+
     async def play() -> None:
-        hub = EventHub(catalog)
-        async with hub.listening(), hub.listening():
-            admit(hub, 3)
-            with pytest.raises(ApiProblem) as caught:
-                admit(hub, 2)
-        assert (caught.value.status, caught.value.headers["Retry-After"]) == (503, "5")
-        admit(hub, 2)
+        snapshot = bytes(range(200)) * 1000
+        before = sys.getrefcount(snapshot)
+        stream = told(EventHub(catalog), feed(catalog, opening=(b"data: ", snapshot, b"\n\n")))
+        assert await anext(stream) == b"retry: 2000\n\n" and await anext(stream) == b"data: "
+        sent = b""
+        while not sent.endswith(b"\n\n"):
+            piece = await anext(stream)
+            assert len(piece) <= stream_module.PIECE
+            sent += piece
+        assert sent == snapshot + b"\n\n"
+        await anext(stream)
+        assert sys.getrefcount(snapshot) == before
+        await stream.aclose()
 
     asyncio.run(play())
 
 
 def test_a_client_that_takes_nothing_is_hung_up_on(monkeypatch) -> None:
-    monkeypatch.setattr(stream_module, "SEND_SECONDS", 0.05)
+    monkeypatch.setattr(patience, "SEND_SECONDS", 0.05)
 
     async def play() -> None:
         async def endless() -> AsyncIterator[bytes]:

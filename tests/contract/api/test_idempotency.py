@@ -115,11 +115,14 @@ def test_a_request_whose_process_died_before_its_effect_is_done_by_the_next(serv
 def test_an_upload_whose_process_died_after_its_commit_is_answered_with_that_upload(service, key, upload):
     held = begun(service, "/v1/uploads", upload, key, lease_seconds=0)
     place = f"uploads/{secrets.token_hex(8)}/log.tar"
-    multipart = service.store.create_multipart(place)
+    multipart = service.store.create_multipart(place, 5 << 20)
     with requests.bound(held), service.catalog.transaction() as tx:
-        row = uploads.add(tx, **upload, parts=1, object_key=place, s3_upload_id=multipart, seconds=3600)
+        # The setting was another one when it was opened: its parts keep their size.
+        file = {"parts": 1, "part_size": 7 << 20, "object_key": place, "s3_upload_id": multipart}
+        row = uploads.add(tx, **upload, **file, seconds=3600)
     answer = post(service, "/v1/uploads", upload, key)
     assert answer.status_code == 201
+    assert answer.json()["part_size"] == 7 << 20
     assert answer.json()["id"] == row.id
     assert answer.headers["location"] == f"/v1/uploads/{row.id}"
     assert httpx.put(answer.json()["parts"][0]["url"], content=b"123456789").is_success

@@ -88,6 +88,22 @@ def test_the_listing_can_be_narrowed(service, written):
     assert service.refused(answer, 422, "invalid-request")["errors"][0]["where"] == "query scan"
 
 
+def test_the_listing_comes_in_pages(service, written):
+    job, _ = written
+    url = f"/v1/jobs/{job}/labels"
+    whole = service.http.get(url, params={"side": "refined"}).json()
+    assert whole.get("next") is None
+    paths, cursor = [], {}
+    while cursor is not None:
+        page = service.http.get(url, params={"side": "refined", "limit": 2} | cursor).json()
+        assert len(page["files"]) <= 2
+        paths += [file["path"] for file in page["files"]]
+        cursor = {"cursor": page["next"]} if page.get("next") else None
+    assert paths == [file["path"] for file in whole["files"]] and len(paths) == 3
+    for bad in ({"limit": 0}, {"limit": 1001}, {"cursor": "x"}):
+        service.refused(service.http.get(url, params=bad), 422, "invalid-request")
+
+
 def test_one_file_is_there_without_the_archive(service, written):
     job, contents = written
     for path, data in contents.items():

@@ -1,6 +1,8 @@
 """Who asks too much is told when to come back, and nobody else notices."""
 
 import secrets
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -12,18 +14,17 @@ TOKEN = secrets.token_urlsafe(32)
 UPLOAD = {"kind": "drive", "filename": "log.tar", "size": 9}
 
 
-BURST = 12
+BURST = 16
 
 
 @pytest.fixture(scope="module")
 def strict(api_process, redis_server) -> str:
     """An API that lets each key ask so often, and again after minutes."""
     limits = {"rate_per_second": "0.001", "rate_burst": str(BURST), "failures_per_second": "0.001"}
-    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_active_jobs": "1"}
+    quotas = {"failures_burst": "3", "max_open_uploads": "2", "max_open_upload_bytes": "1000", "max_active_jobs": "1"}
     redis_url = redis_server.removesuffix("/0") + "/4"
-    return api_process(
-        token=TOKEN, redis_url=redis_url, training="1", trusted_proxies="127.0.0.1", **limits, **quotas
-    )  # fmt: skip
+    others = {"event_streams": "4", "trusted_proxies": "127.0.0.1", "training": "1"}
+    return api_process(token=TOKEN, redis_url=redis_url, **limits, **quotas, **others)
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +75,16 @@ def test_a_project_has_so_many_open_uploads_and_may_go_on_when_one_is_closed(fre
     assert again.status_code == 201, "a refusal for now is not kept with the key"
 
 
+def test_a_project_has_so_many_bytes_in_open_uploads(fresh):
+    """The disk is everybody's: what is announced counts, from the announcement to the completion."""
+    with fresh() as http:
+        first = http.post("/v1/uploads", json=UPLOAD | {"size": 900})
+        document = refused(http.post("/v1/uploads", json=UPLOAD | {"size": 101}), "quota-reached")
+        assert document["errors"][0]["where"] == "size" and "900 bytes" in document["errors"][0]["what"]
+        assert http.delete(first.headers["location"]).status_code == 204
+        assert http.post("/v1/uploads", json=UPLOAD | {"size": 101}).status_code == 201
+
+
 def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
     announced = UPLOAD | {"kind": "annotations", "size": 22}
     with fresh() as http:
@@ -82,9 +93,34 @@ def test_a_project_has_so_many_jobs_and_trainings_under_way(fresh):
         parts = {"parts": [{"number": 1, "etag": etag}]}
         annotations = http.post(f"/v1/uploads/{upload['id']}/complete", json=parts).json()["id"]
         request = {"annotations": annotations, "backbone": "scratch"}
-        assert http.post("/v1/models/train", json=request | {"name": "first"}).status_code == 202
+        first = http.post("/v1/models/train", json=request | {"name": "first"})
+        assert first.status_code == 202
         second = http.post("/v1/models/train", json=request | {"name": "second"})
         assert refused(second, "quota-reached")["errors"][0]["where"] == "jobs"
+        path = f"/v1/trainings/{first.json()['id']}"
+        assert http.post(f"{path}/cancel").json()["state"] == "cancelled"
+        assert http.post("/v1/models/train", json=request | {"name": "second"}).status_code == 202
+        refused(http.post(f"{path}/retry"), "quota-reached")
+
+
+def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_once(fresh, strict):
+    with fresh() as greedy, fresh() as modest, ExitStack() as streams:
+
+        def open_stream(http: httpx.Client) -> httpx.Response:
+            return streams.enter_context(http.stream("GET", "/v1/events"))
+
+        with ThreadPoolExecutor(BURST - 4) as pool:
+            answers = list(pool.map(open_stream, [greedy] * (BURST - 4)))
+        opened = [answer for answer in answers if answer.status_code == 200]
+        assert len(opened) == 2, "half of the four"
+        refusal = next(answer for answer in answers if answer.status_code != 200)
+        refusal.read()
+        refused(refusal, "too-many-streams")
+        assert open_stream(modest).status_code == 200
+        opened[0].close()
+        while "l3ps_event_streams 2.0" not in httpx.get(f"{strict}/metrics").text:
+            pass  # until the service has seen it
+        assert open_stream(greedy).status_code == 200
 
 
 def test_wrong_credentials_are_limited_by_address_and_right_ones_pass_all_the_same(fresh, strict):

@@ -1,6 +1,7 @@
 """Every error of the API is a problem document that names the field and the remedy."""
 
 import socket
+from collections.abc import Iterator
 
 import httpx
 import pytest
@@ -105,17 +106,22 @@ def test_healthy_ready_and_measured(service):
     assert "/v1/jobs/none" not in metrics
 
 
-@pytest.fixture(scope="session")
-def cut_off(api_process):
-    """An API whose database, object store and queue all refuse connections."""
+@pytest.fixture(scope="module")
+def nobody_there() -> Iterator[str]:
+    """An address that refuses connections."""
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))  # bound but not listening: connections are refused and nobody else takes it
-        where = f"127.0.0.1:{closed.getsockname()[1]}"
-        yield api_process(
-            database_url=f"postgresql://nobody:nothing@{where}/none",
-            objects_url=f"s3://KEY:SECRETSECRET@{where}/none?secure=0",
-            redis_url=f"redis://{where}/0",
-        )
+        yield f"127.0.0.1:{closed.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module")
+def cut_off(api_process, nobody_there) -> str:
+    """An API whose database, object store and queue all refuse connections."""
+    return api_process(
+        database_url=f"postgresql://nobody:nothing@{nobody_there}/none",
+        objects_url=f"s3://KEY:SECRETSECRET@{nobody_there}/none?secure=0",
+        redis_url=f"redis://{nobody_there}/0",
+    )
 
 
 def test_a_service_cut_off_lives_and_says_what_is_missing(service, cut_off):
@@ -132,9 +138,14 @@ def test_what_cannot_be_done_now_may_be_tried_again(service, cut_off):
     answer = httpx.get(f"{cut_off}/v1/drives", timeout=30)
     service.refused(answer, 503, "catalog-unavailable")
     assert int(answer.headers["retry-after"]) > 0
+
+
+def test_an_upload_without_an_object_store_may_be_tried_again(service, api_process, nobody_there):
+    api = api_process(objects_url=f"s3://KEY:SECRETSECRET@{nobody_there}/none?secure=0")
     upload = {"kind": "drive", "filename": "log.tar", "size": 10}
-    answer = httpx.post(f"{cut_off}/v1/uploads", json=upload, timeout=30)
+    answer = httpx.post(f"{api}/v1/uploads", json=upload, timeout=30)
     service.refused(answer, 503, "object-store-unavailable")
+    assert int(answer.headers["retry-after"]) > 0
     assert "SECRETSECRET" not in answer.text
 
 

@@ -125,12 +125,16 @@ def test_annotations_that_cannot_be_used_fail_with_the_trainer_s_words(command, 
 
 
 def test_an_unknown_backbone_fails_and_names_the_known(service, uploaded):
-    request = {"name": "unknown", "annotations": uploaded["id"], "backbone": "resnet"}
+    classes = {"classes": [{"name": "car", "id": 4}], "void": [0]}
+    request = {"name": "unknown", "annotations": uploaded["id"], "backbone": "resnet", "classes": classes}
     training = service.http.post("/v1/models/train", json=request).json()
     failed = service.wait_for_training(training["id"])
     (problem,) = failed["errors"]
     assert (failed["state"], problem["code"]) == ("failed", "unknown-backbone")
     assert "scratch" in problem["remedy"]
+    assert [entry["id"] for entry in failed["settings"]["classes"]["classes"]] == [4]
+    listed = service.http.get("/v1/trainings", params={"state": "failed"}).json()["items"]
+    assert "classes" not in next(item["settings"] for item in listed if item["id"] == training["id"])
 
 
 @pytest.mark.once
@@ -172,6 +176,11 @@ def test_only_annotations_can_be_learnt_from(service, uploaded):
         ("recipe", "--out=/tmp"),
         ("name", "a/b"),
         ("size", [64]),
+        ("classes", {"classes": [{"name": "car", "id": "x" * 101}]}),
+        ("classes", {"classes": [{"name": "car", "category": "x" * 101}]}),
+        ("classes", {"classes": [{"name": "car", "nuscenes": "x" * 101}]}),
+        ("classes", {"classes": [{"name": "car"}], "void": ["x" * 101]}),
+        ("classes", {"classes": [{"name": "car"}], "void": [10**400]}),
     ],
 )
 def test_names_are_names_and_never_paths_or_options(service, uploaded, field, value):

@@ -125,6 +125,24 @@ def test_an_upload_goes_on_after_its_client_died(service):
     service.refused(service.http.post(f"{path}/parts", json={"numbers": [1]}), 409, "upload-closed")
 
 
+def test_an_upload_that_was_joined_and_not_recorded_says_so_and_is_completed(service):
+    """The API was killed between the store's work and its own commit."""
+    data = tar_of(blob=bytes(12 * MiB))
+    upload = service.announce(len(data))
+    service.put_parts(upload, data)
+    path = f"/v1/uploads/{upload['id']}"
+    assert service.http.get(path).json()["joined"] is False
+    with service.catalog.reading() as session:
+        row = uploads.get(session, upload["id"])
+    arrived = service.store.list_parts(row.object_key, row.s3_upload_id)
+    service.store.complete_multipart(row.object_key, row.s3_upload_id, arrived)
+    progress = service.http.get(path).json()
+    assert (progress["state"], progress["joined"], progress["received"]) == ("open", True, [])
+    assert service.http.post(f"{path}/complete", json={}).status_code == 202
+    progress = service.http.get(path).json()
+    assert (progress["state"], progress["joined"]) == ("complete", False)
+
+
 def test_an_upload_is_not_completed_before_all_has_arrived(service):
     data = tar_of(blob=bytes(12 * MiB))
     upload = service.announce(len(data))

@@ -237,11 +237,8 @@ def test_410_switches_a_webhook_off_until_it_is_switched_on(service, receiver, h
     hook = hooked(receiver.url)
     id = ping(hook)
     assert delivered(hook, id)["attempts"] == 1
-    assert watcher.next().document["data"] == {
-        "id": hook["id"],
-        "url": receiver.url,
-        "reason": "the receiver answered 410: it wants no more messages",
-    }
+    reason = "the receiver answered 410: it wants no more messages"
+    assert watcher.next().document["data"] == {"id": hook["id"], "reason": reason}, "a URL may be a secret"
     watcher.close()
     shown = service.http.get(f"/v1/webhooks/{hook['id']}").json()
     assert not shown["enabled"] and "410" in shown["disabled_reason"]
@@ -289,7 +286,9 @@ def test_an_address_that_has_become_forbidden_is_refused_at_the_delivery(service
             webhooks.lock(tx.session, hook["id"]).url = f"http://127.0.0.2:{port}/hook"
         row = delivered(hook, ping(hook))
     assert row["state"] == "failed"
-    assert {attempt["error"] for attempt in row["log"]} == {"not sent: '127.0.0.2' is not a public address"}
+    assert {attempt["error"] for attempt in row["log"]} == {
+        "not sent: '127.0.0.2' is no public address and no name of one"
+    }
     assert receiver.got.empty()
 
 

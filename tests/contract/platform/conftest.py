@@ -3,6 +3,7 @@
 import secrets
 import threading
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,12 @@ from l3ps_platform.catalog import (
     JobRow,
     ProjectRow,
     StageMessage,
+    StageName,
     StageRow,
     Transaction,
+    jobs,
+    outputs,
 )
-from l3ps_platform.catalog import jobs as catalog_jobs
 from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.catalog.migrate import upgrade
 from l3ps_platform.errors import InvalidSignature, ObjectMissing, StoreError, UploadError
@@ -160,9 +163,7 @@ class Play:
         """Claim the stage of a message, the next one sent by default."""
         message = message or self.sent.pop(0)
         with self.catalog.transaction() as tx:
-            return workflow.claim(
-                tx, message.stage_id, message.attempt, owner, lease_seconds=lease, max_attempts=MAX_ATTEMPTS
-            )
+            return workflow.claim(tx, message.stage_id, message.attempt, owner, lease_seconds=lease)
 
     def run(self, end: Callable[[Transaction, workflow.Claim], None], message: StageMessage | None = None) -> None:
         """Claim the stage of a message and end it."""
@@ -182,7 +183,7 @@ class Play:
     def job(self, id: str) -> JobRow:
         """The job as it is now."""
         with self.catalog.reading() as session:
-            return catalog_jobs.get(session, id)
+            return jobs.get(session, id)
 
     def states(self, job_id: str) -> list[tuple[str, str]]:
         """(name, state) of a job's stages in the order they were planned."""
@@ -195,7 +196,6 @@ class Play:
             return catalog_stages.get(session, id)
 
 
-MAX_ATTEMPTS = 3
 COST = workflow.Cost(1.5, 2.5, 100.0, scans=2, points=10, steps={"vote": (0.5, 50.0)})
 
 
@@ -217,14 +217,82 @@ def cost() -> workflow.Cost:
 
 @pytest.fixture
 def tidy(catalog: Catalog, redis_url: str, tmp_path: Path) -> Iterator[Callable[..., workflow.Report]]:
-    """One round of the reconciler over the catalog, a real queue and a directory store; settings can be given."""
+    """One round of the reconciler over the catalog and a real queue, ``tidy.sweep`` one of the sweeper over a directory
+    store; settings can be given."""
     queue = Queue(Settings(redis_url=redis_url))
     store = DirectoryStore(tmp_path / "store", "http://api")
     store.ensure()
 
     def run(**settings: Any) -> workflow.Report:
-        return workflow.Reconciler(catalog, queue, store, Settings(redis_url=redis_url, **settings)).run_once()
+        return workflow.Reconciler(catalog, queue, Settings(redis_url=redis_url, **settings)).run_once()
 
+    def sweep(**settings: Any) -> dict[str, int]:
+        return workflow.Sweeper(catalog, store, Settings(**settings)).run_once()
+
+    run.sweep = sweep
     run.queue, run.store, run.settings = queue, store, Settings(redis_url=redis_url)
     yield run
     queue.close()
+
+
+class House:
+    """Jobs whose stages make real objects under content-addressed keys, and the sweep."""
+
+    def __init__(self, catalog: Catalog, play, sent, store: DirectoryStore) -> None:
+        self.catalog, self.play, self.sent, self.store = catalog, play, sent, store
+
+    def job(self, content: str = "a", *, size: int = 100) -> str:
+        """A finished job over one scene; equal ``content`` means equal outputs."""
+        id = self.play.submit(scenes=1)
+        self.finish(content, size=size)
+        return id
+
+    def finish(self, content: str, *, size: int = 100) -> None:
+        while self.sent:
+            claim = self.play.take()
+            key = f"stages/{DEFAULT_PROJECT}/{claim.name.value}-{content}"
+            if claim.name is StageName.PUBLISH:
+                key = f"jobs/{claim.job_id}"
+                self.store.put_bytes(f"{key}/poses.txt", b"poses")
+                self.end(claim, f"{key}/manifest.json")
+                continue
+            self.pin(claim, key)
+            self.store.put_bytes(f"{key}/part-1.bin", b"x" * size)
+            self.end(claim, f"{key}/{outputs.MAIN[claim.name]}", size)
+
+    def pin(self, claim, key: str) -> None:
+        with self.catalog.transaction() as tx:
+            workflow.pin_output(tx, claim, key)
+
+    def end(self, claim, main: str, size: int = 0) -> None:
+        self.store.put_bytes(main, b"{}")
+        with self.catalog.transaction() as tx:
+            workflow.complete(tx, claim, workflow.Cost(1.0), output_key=main)
+            workflow.note_output(tx, main.rpartition("/")[0], size)
+
+    def delete(self, *ids: str) -> None:
+        with self.catalog.transaction() as tx:
+            for id in ids:
+                jobs.delete(tx, id)
+
+    def age(self, row: type, id: str, **since: float) -> None:
+        with self.catalog.transaction() as tx:
+            found = tx.session.get_one(row, id)
+            if row is JobRow:
+                found.finished_at = tx.now - timedelta(**since)
+            else:
+                found.created_at = tx.now - timedelta(**since)
+
+    def sweep(self, **settings) -> dict[str, int]:
+        return workflow.Sweeper(self.catalog, self.store, Settings(**settings)).run_once()
+
+    def groups(self, prefix: str = "") -> set[str]:
+        return {info.key.rpartition("/")[0] for info in self.store.list(prefix)}
+
+
+@pytest.fixture
+def house(catalog: Catalog, play: Play, sent: list[StageMessage], tmp_path: Path) -> House:
+    """See :class:`House`."""
+    store = DirectoryStore(tmp_path / "store", "")
+    store.ensure()
+    return House(catalog, play, sent, store)

@@ -1,6 +1,7 @@
 """Rows and their rules, on SQLite and PostgreSQL."""
 
 import threading
+from contextlib import ExitStack
 from datetime import timedelta
 
 import psycopg
@@ -8,7 +9,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import text
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, OperationalError
 
 from l3ps.errors import DriveLogError, ModelError, Problem
 from l3ps_platform import workflow
@@ -156,6 +157,53 @@ def test_a_database_that_is_away() -> None:
         away.ping()
 
 
+def test_what_is_too_large_for_the_database_is_no_outage(postgres_url: str) -> None:
+    """It would be waited for in vain."""
+    catalog = Catalog(Settings(database_url=postgres_url).catalog_url)
+    with pytest.raises(OperationalError, match="too deep"), catalog.reading() as session:
+        session.execute(text("DO $$ BEGIN RAISE EXCEPTION 'too deep' USING ERRCODE = '54001'; END $$"))
+    catalog.dispose()
+
+
+def test_a_silent_server_is_given_up_in_seconds(postgres_url: str) -> None:
+    catalog = Catalog(Settings(database_url=postgres_url).catalog_url)
+    with catalog.reading() as session:
+        given = session.connection().connection.driver_connection.info.get_parameters()
+    catalog.dispose()
+    idle, between, count = (int(given[f"keepalives_{name}"]) for name in ("idle", "interval", "count"))
+    assert idle + between * count <= 30 and int(given["tcp_user_timeout"]) <= 30_000
+
+
+def test_a_catalog_whose_connections_are_all_in_use_is_busy_and_not_broken(catalog: Catalog, monkeypatch) -> None:
+    monkeypatch.setattr(catalog.engine.pool, "_timeout", 0.0)
+    with ExitStack() as held:
+        for _ in range(catalog.engine.pool.size()):
+            held.enter_context(catalog.reading())
+        with pytest.raises(CatalogUnavailable, match="no connection became free"):
+            catalog.ping()
+
+
+HOSTILE = "a\0b\ud800c"
+
+
+def test_what_one_database_would_refuse_both_keep_cleaned(catalog: Catalog, play) -> None:
+    """A worker that cannot record what it found in a stranger's file cannot end its stage."""
+    info = {"classes": [HOSTILE], HOSTILE: {"nan": float("nan"), "far": -float("inf")}, "good": ["ä\U0001f600", 0.5]}
+    drive = play.drive(info={"scenes": []} | info, format=HOSTILE)
+    with catalog.reading() as session:
+        row = drives.get(session, drive)
+        clean = "a\ufffdb\ufffdc"
+        assert row.format == clean
+        assert row.info == {
+            "scenes": [],
+            "classes": [clean],
+            clean: {"nan": None, "far": None},
+            "good": ["ä\U0001f600", 0.5],
+        }
+        with pytest.raises(NotFound):
+            drives.get(session, HOSTILE)
+
+
 def test_a_database_that_goes_while_a_session_is_open(postgres_url: str) -> None:
     catalog = Catalog(Settings(database_url=postgres_url).catalog_url)
     with pytest.raises(CatalogUnavailable, match="does not answer"), catalog.reading() as session:
@@ -226,7 +274,7 @@ class TestModels:
         rejected = play.model(problems=[BROKEN])
         with catalog.reading() as session:
             row = bundles.get(session, rejected)
-        assert (row.state, row.problem) == (ModelState.REJECTED, {"problems": [BROKEN.as_dict()]})
+        assert (row.state, row.problem) == (ModelState.REJECTED, {"problems": [BROKEN.as_dict()], "count": 1})
         with catalog.transaction() as tx:
             again = workflow.accept_model(tx, name=row.name, filename="m.zip", size=1, object_key="k")
         with catalog.reading() as session:

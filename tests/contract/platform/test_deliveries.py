@@ -2,7 +2,7 @@
 
 import json
 import threading
-from datetime import timedelta
+from datetime import datetime, timedelta
 
 import pytest
 
@@ -38,9 +38,9 @@ class Post:
         with self.catalog.transaction() as tx:
             return [deliveries.ping(tx, webhooks.lock(tx.session, hook)).id for _ in range(count)]
 
-    def take(self, limit: int = 100, owner: str = "one", lease: float = 60) -> list[Parcel]:
+    def take(self, limit: int = 100, owner: str = "one", lease: float = 60, share: int = 100) -> list[Parcel]:
         with self.catalog.transaction() as tx:
-            return deliveries.take(tx, owner, limit=limit, lease_seconds=lease)
+            return deliveries.take(tx, owner, limit=limit, share=share, lease_seconds=lease)
 
     def end(self, parcel: Parcel, attempt: Attempt) -> None:
         with self.catalog.transaction() as tx:
@@ -134,6 +134,128 @@ def test_a_busy_webhook_does_not_keep_others_waiting(post) -> None:
     assert {parcel.webhook_id for parcel in post.take(limit=2)} == {busy, quiet}
 
 
+TIMED_OUT = Attempt(None, "no complete answer within 15 s", 15.0, again_after=timedelta(), timed_out=True)
+
+
+@pytest.fixture
+def others(catalog, post) -> Post:
+    """The same in another project."""
+    with catalog.transaction() as tx:
+        tx.session.add(ProjectRow(id="prj_other", name="other", created_at=tx.now))
+    return Post(catalog.scoped("prj_other"))
+
+
+def test_a_project_whose_receivers_hang_leaves_room_for_others(post, others) -> None:
+    """Fifty of them, with a backlog each: another project's only message is the next to go."""
+    everything = Post(post.catalog.whole())
+    for _ in range(50):
+        post.ping(post.hook(), 4)
+    assert len(everything.take(limit=16, share=8)) == 8, "places stay free for whoever comes"
+    quiet = others.hook()
+    others.ping(quiet)
+    assert [parcel.webhook_id for parcel in everything.take(limit=1, share=8)] == [quiet]
+    assert everything.take(limit=8, share=8) == []
+    assert len(everything.take(limit=16, share=8, owner="another process")) == 8
+
+
+def test_projects_take_turns_and_the_one_with_less_under_way_is_first(post, others) -> None:
+    everything = Post(post.catalog.whole())
+    busy, quiet = [post.hook() for _ in range(3)], others.hook()
+    for hook in busy:
+        post.ping(hook, 2)
+    others.ping(quiet, 3)
+    taken = [everything.take(limit=1)[0].webhook_id for _ in range(6)]
+    assert [hook == quiet for hook in taken].count(True) == 3
+    assert set(taken) - {quiet} == set(busy), "and within a project its webhooks do"
+
+
+def test_a_webhook_whose_last_turn_is_longest_ago_is_next(post) -> None:
+    hooks = [post.hook() for _ in range(3)]
+    for hook in hooks:
+        post.ping(hook, 3)
+    turns = []
+    for _ in range(6):
+        (parcel,) = post.take(limit=1)
+        turns.append(parcel.webhook_id)
+        post.end(parcel, REFUSED)
+    assert turns[:3] == turns[3:] and set(turns) == set(hooks)
+
+
+def test_a_receiver_that_times_out_is_left_alone_longer_and_longer_and_then_asked_once(post, catalog) -> None:
+    hook = post.hook()
+    post.ping(hook, 6)
+    for parcel in post.take():
+        post.end(parcel, TIMED_OUT)
+    assert post.take() == []
+
+    def pause() -> tuple[timedelta, timedelta]:
+        """Of the last attempt: the pause, and how long nothing had been delivered then."""
+        row = post.get(hook)
+        at = max(datetime.fromisoformat(entry["at"]) for delivery in post.rows(hook) for entry in delivery.log)
+        return row.paused_until - at, at - row.failing_since
+
+    assert pause()[0] == timedelta(seconds=15)
+    for failing in (timedelta(minutes=3), timedelta(days=1)):
+        with catalog.transaction() as tx:
+            row = webhooks.lock(tx.session, hook)
+            row.failing_since, row.paused_until = tx.now - failing, tx.now
+        (probe,) = post.take()
+        post.end(probe, TIMED_OUT)
+        paused, lasted = pause()
+        assert paused == min(lasted, deliveries.LONGEST_PAUSE)
+    with catalog.transaction() as tx:
+        webhooks.lock(tx.session, hook).paused_until = tx.now
+    (probe,) = post.take()
+    post.end(probe, TAKEN)
+    assert post.get(hook).paused_until is None and len(post.take()) == deliveries.PER_WEBHOOK
+
+
+def test_a_receiver_that_refuses_at_once_is_not_left_alone(post) -> None:
+    hook = post.hook()
+    post.ping(hook, 2)
+    first, second = post.take()
+    post.end(first, TIMED_OUT)
+    post.end(second, REFUSED)
+    assert len(post.take()) == 2
+
+
+def test_a_long_backlog_of_a_webhook_that_is_switched_off_fails_in_portions(post, monkeypatch) -> None:
+    monkeypatch.setattr(deliveries, "BATCH", 2)
+    hook, other = post.hook(), post.hook()
+    post.ping(hook, 5)
+    post.ping(other, 2)
+    with post.catalog.transaction() as tx:
+        for row in tx.session.query(DeliveryRow).filter_by(webhook_id=hook):
+            row.next_at += timedelta(days=1)
+        deliveries.disable(tx, webhooks.lock(tx.session, hook), "on request")
+    assert post.states(hook).count("failed") == 2
+    taken = [parcel.webhook_id for _ in range(4) for parcel in post.take(limit=1)]
+    assert post.states(hook) == ["failed"] * 5 and taken == [other, other]
+
+
+def test_a_webhook_is_deleted_in_portions_and_events_do_not_wait_for_it(post, play, catalog, monkeypatch) -> None:
+    """Whoever writes an event holds a lock that all who do so need."""
+    monkeypatch.setattr(deliveries, "BATCH", 2)
+    hook, job = post.hook(), play.submit()
+    post.ping(hook, 5)
+    forget, portions = webhooks.forget_deliveries, []
+
+    def meanwhile(session, id: str, limit: int) -> int:
+        gone = forget(session, id, limit)
+        portions.append(gone)
+        if len(portions) == 1 and catalog.engine.dialect.name == "postgresql":  # SQLite has one writer
+            with catalog.transaction() as tx:
+                workflow.cancel_job(tx, job)
+        return gone
+
+    monkeypatch.setattr(webhooks, "forget_deliveries", meanwhile)
+    deliveries.forget(catalog, hook)
+    assert set(portions[:-1]) <= {1, 2} and sum(portions) >= 5
+    assert post.rows(hook) == []
+    with pytest.raises(NotFound):
+        deliveries.forget(catalog, hook)
+
+
 def test_what_a_dead_deliverer_held_is_made_again_under_the_same_id(post) -> None:
     hook = post.hook()
     (id,) = post.ping(hook)
@@ -197,14 +319,15 @@ def test_410_switches_a_webhook_off_and_says_so(post) -> None:
     post.end(first, GONE)
     assert not post.get(hook).enabled and "410" in post.get(hook).disabled_reason
     (told,) = post.rows(watcher)
-    assert json.loads(told.body)["data"]["id"] == hook
+    data = json.loads(told.body)["data"]
+    assert data == {"id": hook, "reason": post.get(hook).disabled_reason}, "a URL may be a secret"
     with pytest.raises(Conflict, match="switched off"):
         post.ping(hook)
     post.end(second, REFUSED)  # was under way: it is not tried again
     assert post.states(hook)[:2] == ["failed", "failed"]
 
 
-def test_what_waits_for_a_webhook_that_is_switched_off_fails_and_can_be_replayed(post) -> None:
+def test_what_waits_for_a_webhook_that_is_switched_off_fails_and_can_be_replayed(post, monkeypatch) -> None:
     hook = post.hook()
     ids = post.ping(hook, 2)
     with post.catalog.transaction() as tx:
@@ -212,12 +335,15 @@ def test_what_waits_for_a_webhook_that_is_switched_off_fails_and_can_be_replayed
         deliveries.disable(tx, row, "on request")
     assert post.states(hook) == ["failed", "failed"] and post.take() == []
     with post.catalog.transaction() as tx:
-        row = webhooks.lock(tx.session, hook)
-        deliveries.enable(row)
-        tx.session.flush()
         since = tx.now - timedelta(hours=1)
-        assert deliveries.replay(tx, row, webhooks.failed_since(tx.session, hook, since)) == 2
-        assert webhooks.failed_since(tx.session, hook, since) == []
+    with pytest.raises(Conflict, match="switched off"):
+        deliveries.replay_failed(post.catalog, hook, since)
+    with post.catalog.transaction() as tx:
+        deliveries.enable(webhooks.lock(tx.session, hook))
+    monkeypatch.setattr(deliveries, "BATCH", 1)
+    assert deliveries.replay_failed(post.catalog, hook, since + timedelta(hours=2)) == 0
+    assert deliveries.replay_failed(post.catalog, hook, since) == 2
+    assert deliveries.replay_failed(post.catalog, hook, since) == 0
     assert sorted(parcel.id for parcel in post.take()) == sorted(ids)
 
 

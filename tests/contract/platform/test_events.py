@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from l3ps_platform import workflow
-from l3ps_platform.catalog import Catalog, EventKind, JobState, ProjectRow, events, jobs
+from l3ps_platform.catalog import Catalog, EventKind, JobState, ProjectRow, StageState, events, jobs
 from l3ps_platform.workflow import Retry
 
 pytestmark = pytest.mark.services
@@ -59,6 +59,23 @@ def test_cancelling_is_told_once(play, catalog) -> None:
         with catalog.transaction() as tx:
             workflow.cancel_job(tx, job)
     assert kinds(catalog, job) == ["job.queued", "job.cancelled"]
+
+
+def test_a_scene_that_is_cancelled_between_its_stages_is_not_told_as_done(play, catalog, sent) -> None:
+    """Its segment stage ends before it hears of the cancel: there are primal labels and no others."""
+    job = play.submit(scenes=1)
+    claim = play.take()
+    with catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    with catalog.transaction() as tx:
+        workflow.complete(tx, claim, workflow.Cost(1.0), output_key="o/primal")
+    assert kinds(catalog, job) == ["job.queued", "job.running", "job.cancelled"]
+    with catalog.reading() as session:
+        assert [scene.state for scene in jobs.scenes(session, job)] == [StageState.CANCELLED]
+    with catalog.transaction() as tx:
+        workflow.retry_job(tx, job)
+    assert play.finish_all() == ["refine", "publish"]
+    assert kinds(catalog, job)[-2:] == ["scene.done", "job.succeeded"]
 
 
 def test_what_was_rolled_back_did_not_happen(play, catalog) -> None:

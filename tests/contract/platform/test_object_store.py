@@ -103,7 +103,7 @@ def test_keys_that_could_leave_the_store_are_refused_by_every_method(
         lambda: store.delete(key),
         lambda: store.presign_get(key, 60),
         lambda: store.presign_put(key, 60),
-        lambda: store.create_multipart(key),
+        lambda: store.create_multipart(key, 5 * MiB),
     ]
     for call in calls:
         with pytest.raises(InvalidKey):
@@ -140,7 +140,7 @@ def test_presigned_urls_permit_only_what_they_say(store: ObjectStore, tamper: st
 
 def test_multipart_joins_parts_by_number(store: ObjectStore) -> None:
     """Uploaded and reported out of order, through presigned URLs, with the quotes S3 puts around etags."""
-    upload = store.create_multipart("up/drive.zip")
+    upload = store.create_multipart("up/drive.zip", 5 * MiB)
     bodies = {1: b"1" * (5 * MiB), 2: b"2" * (5 * MiB), 3: b"three"}
     parts = []
     for number in (3, 1, 2):
@@ -154,7 +154,7 @@ def test_multipart_joins_parts_by_number(store: ObjectStore) -> None:
 
 
 def test_a_part_uploaded_again_counts_the_last_time(store: ObjectStore) -> None:
-    upload = store.create_multipart("up/x")
+    upload = store.create_multipart("up/x", 5 * MiB)
     etags = [httpx.put(store.presign_part("up/x", upload, 1, 60), content=b).headers["etag"] for b in (b"old", b"new")]
     with pytest.raises(UploadError):
         store.complete_multipart("up/x", upload, [Part(1, etags[0])])
@@ -164,7 +164,7 @@ def test_a_part_uploaded_again_counts_the_last_time(store: ObjectStore) -> None:
 
 @pytest.mark.parametrize("parts", [[], [Part(1, "0" * 32)], [Part(2, "0" * 32)]], ids=["none", "wrong-etag", "missing"])
 def test_parts_that_do_not_fit(store: ObjectStore, parts: list[Part]) -> None:
-    upload = store.create_multipart("up/x")
+    upload = store.create_multipart("up/x", 5 * MiB)
     httpx.put(store.presign_part("up/x", upload, 1, 60), content=b"body")
     with pytest.raises(UploadError):
         store.complete_multipart("up/x", upload, parts)
@@ -172,7 +172,7 @@ def test_parts_that_do_not_fit(store: ObjectStore, parts: list[Part]) -> None:
 
 
 def test_an_aborted_upload_is_gone(store: ObjectStore) -> None:
-    upload = store.create_multipart("up/x")
+    upload = store.create_multipart("up/x", 5 * MiB)
     etag = httpx.put(store.presign_part("up/x", upload, 1, 60), content=b"body").headers["etag"]
     store.abort_multipart("up/x", upload)
     store.abort_multipart("up/x", upload)

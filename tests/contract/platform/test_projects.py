@@ -73,6 +73,16 @@ def test_two_projects_may_give_two_models_one_name(catalog: Catalog, other: Cata
             assert bundles.by_name(session, "street").id == id
 
 
+def test_a_model_named_like_the_id_of_another_does_not_take_its_place(catalog: Catalog) -> None:
+    with catalog.transaction() as tx:
+        id = workflow.accept_model(tx, name="street", **FILE).id
+        shadow = workflow.accept_model(tx, name=id, **FILE).id
+    with catalog.reading() as session:
+        assert bundles.by_name(session, id).id == id
+        assert bundles.by_name(session, "street").id == id
+        assert bundles.by_name(session, shadow).id == shadow
+
+
 def test_a_new_row_belongs_to_the_project_of_its_catalog(catalog: Catalog, other: Catalog) -> None:
     with other.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", **FILE)

@@ -1,8 +1,10 @@
 """What crashes, lost messages and impatient clients leave behind is put right, on both databases and a real Redis."""
 
 import threading
+from datetime import timedelta
 
 import pytest
+from sqlalchemy import select
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import (
@@ -13,15 +15,17 @@ from l3ps_platform.catalog import (
     QueueName,
     StageMessage,
     StageName,
+    StageRow,
     StageState,
     UploadState,
     drives,
     uploads,
 )
+from l3ps_platform.catalog import stages as catalog_stages
 from l3ps_platform.errors import QueueUnavailable
 from l3ps_platform.queue import Queue
 from l3ps_platform.settings import Settings
-from l3ps_platform.workflow import Reconciler, Retry
+from l3ps_platform.workflow import Reconciler, Retry, resending
 
 
 def test_nothing_to_do(tidy, play) -> None:
@@ -38,15 +42,15 @@ def test_a_dead_worker_s_stage_is_tried_again_and_the_job_succeeds(tidy, play, s
     assert play.job(job).state is JobState.SUCCEEDED
 
 
-def test_a_stage_that_kills_every_worker_fails_with_a_reason(tidy, play, sent) -> None:
-    job = play.submit(scenes=1)
-    for _ in range(3):
-        play.take(lease=-1)
-        tidy(retry_seconds=0)
-    assert not sent
-    row = play.job(job)
-    assert row.state is JobState.FAILED
-    assert "stopped answering" in row.error["message"]
+def test_a_stage_far_beyond_its_time_limit_is_not_held_by_its_lease(tidy, play, sent) -> None:
+    """Its worker ought to have ended it at the limit and goes on to prolong its lease."""
+    play.submit(scenes=1)
+    claim = play.take(lease=3600.0)
+    assert tidy(stage_seconds=3600.0, lease_seconds=0.0, train_seconds=0.001).hanging == 0
+    assert tidy(stage_seconds=0.0, lease_seconds=0.0).hanging == 1
+    stage = play.stage(claim.stage_id)
+    assert (stage.state, stage.error["cause"]) == (StageState.WAITING, "timeout")
+    assert "its worker did not stop it" in stage.error["message"]
 
 
 def test_a_live_lease_is_left_alone(tidy, play, sent) -> None:
@@ -87,13 +91,60 @@ def test_a_lost_message_is_sent_again_but_one_that_waits_is_not(tidy, play, sent
     assert sent == [lost]
 
 
+def test_a_lost_message_is_sent_again_behind_a_backlog_of_any_length(tidy, play, sent) -> None:
+    """Nobody serves the queue `segment`; the message of a drive that came later never left the API."""
+    play.submit(scenes=250)
+    tidy.queue.send(sent)
+    sent.clear()
+    with play.catalog.transaction() as tx:
+        workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
+    (lost,) = sent
+    sent.clear()
+    assert tidy(resend_seconds=-1).resent == 1
+    assert sent == [lost]
+
+
+def test_many_lost_messages_leave_in_portions_and_each_once(tidy, play, sent, catalog, monkeypatch) -> None:
+    monkeypatch.setattr(resending, "BATCH", 4)
+    play.submit(scenes=10)
+    lost = sent.copy()
+    sent.clear()
+    with catalog.transaction() as tx:
+        for message in lost:
+            catalog_stages.get(tx.session, message.stage_id).queued_at = tx.now - timedelta(minutes=1)
+    resenders = [resending.Resender(catalog, tidy.queue, tidy.settings) for _ in range(2)]
+    for resender in resenders:
+        resender._look()  # both see all ten
+    rounds = [resender.run_once() for _ in range(3) for resender in resenders]
+    assert rounds == [4, 0, 4, 0, 2, 0]
+    assert sorted(m.stage_id for m in sent) == [m.stage_id for m in lost]
+
+
+def test_queues_are_read_when_something_is_overdue_and_no_more_often_than_messages_are_sent_again(
+    tidy, play, catalog, monkeypatch
+) -> None:
+    reads = []
+    pending = tidy.queue.pending
+    monkeypatch.setattr(tidy.queue, "pending", lambda name: reads.append(name) or pending(name))
+    reconciler = Reconciler(catalog, tidy.queue, tidy.settings)
+    play.submit(scenes=1)
+    assert (reconciler.run_once().resent, reads) == (0, [])
+    with catalog.transaction() as tx:
+        for stage in tx.session.scalars(select(StageRow).where(StageRow.state == StageState.QUEUED)):
+            stage.queued_at = tx.now - timedelta(minutes=1)
+    late = Reconciler(catalog, tidy.queue, tidy.settings)
+    assert (late.run_once().resent, late.run_once().resent, reads) == (1, 0, ["segment"])
+
+
 def test_a_drive_s_check_is_tried_again_too(tidy, play, sent) -> None:
     with play.catalog.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=1, object_key="uploads/u/d.zip")
     tidy.store.put_bytes("uploads/u/d.zip", b"archive")
+    crashed = workflow.failure("it was killed", workflow.Cause.CRASHED)
     for _ in range(3):
-        play.take(lease=-1)
-        tidy(retry_seconds=0)
+        play.run(lambda tx, claim: workflow.fail(tx, claim, crashed, retry=Retry(3, 0)))
+        tidy()
+    tidy.sweep()
     with play.catalog.reading() as session:
         row = drives.get(session, drive.id)
     assert row.state is DriveState.REJECTED
@@ -112,7 +163,7 @@ def test_a_drive_deleted_while_its_archive_is_swept_stays_deleted(tidy, play, mo
         delete(key)
 
     monkeypatch.setattr(tidy.store, "delete", meanwhile)
-    assert tidy().archives == 1
+    assert tidy.sweep()["archives"] == 1
     with catalog.reading() as session:
         swept = drives.many(session, [rejected])[rejected]
     assert swept.deleted_at is not None and swept.object_key is None
@@ -126,16 +177,16 @@ def test_archives_of_rejected_and_deleted_drives_are_deleted(tidy, play, sent) -
             drives.lock(tx.session, drive).object_key = key
     with play.catalog.transaction() as tx:
         drives.delete(tx, deleted)
-    assert tidy().archives == 2
+    assert tidy.sweep()["archives"] == 2
     assert [info.key for info in tidy.store.list()] == ["a/3"]
-    assert tidy().archives == 0
+    assert tidy.sweep()["archives"] == 0
 
 
 def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
     """Their parts leave the store; a fresh one stays."""
     made = {}
     for name, seconds in (("old", -1), ("new", 3600)):
-        upload_id = tidy.store.create_multipart(f"u/{name}")
+        upload_id = tidy.store.create_multipart(f"u/{name}", 5 << 20)
         with catalog.transaction() as tx:
             row = uploads.add(
                 tx,
@@ -148,7 +199,7 @@ def test_abandoned_uploads_are_aborted(tidy, catalog: Catalog) -> None:
                 seconds=seconds,
             )
         made[name] = (row.id, upload_id)
-    assert tidy().uploads == 1
+    assert tidy.sweep()["uploads"] == 1
     with catalog.reading() as session:
         assert uploads.get(session, made["old"][0]).state is UploadState.ABORTED
         assert uploads.get(session, made["new"][0]).state is UploadState.OPEN
@@ -204,7 +255,7 @@ def test_a_dead_redis_is_said_so_and_the_row_stays_queued(catalog: Catalog, play
 def test_the_loop_stops_when_told(tidy, catalog: Catalog) -> None:
     stop = threading.Event()
     stop.set()
-    Reconciler(catalog, tidy.queue, tidy.store, tidy.settings).run(stop)
+    Reconciler(catalog, tidy.queue, tidy.settings).run(stop)
 
 
 def test_a_message_that_a_killed_worker_held_is_forgotten_when_its_stage_is_over(tidy, play, sent, redis_url) -> None:

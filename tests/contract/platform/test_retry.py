@@ -79,6 +79,26 @@ def test_outputs_that_are_gone_are_made_again(play, sent) -> None:
     assert play.finish_all() == ["segment", "refine", "publish"]
 
 
+def test_only_outputs_whose_reader_failed_are_looked_for(play, sent, half) -> None:
+    """Each look is a request to the store, and a job may have 850 scenes."""
+
+    def kept(job: str) -> list[str]:
+        with play.catalog.reading() as session:
+            return workflow.outputs_to_keep(session, job)
+
+    assert kept(half) == [], "one scene is published, of the other nothing is done"
+    job = play.submit(scenes=2)
+    assert kept(job) == [], "it is not over"
+    for outcome in ("first", "second"):
+        play.run(
+            lambda tx, claim, outcome=outcome: workflow.complete(tx, claim, workflow.Cost(1.0), output_key=outcome)
+        )
+    play.run(fail)
+    with play.catalog.transaction() as tx:
+        workflow.cancel_job(tx, job)
+    assert kept(job) == ["first"], "the other scene's refinement was cancelled before it began"
+
+
 def test_a_job_cancelled_before_its_drive_was_checked_is_planned(play, sent) -> None:
     with play.catalog.transaction() as tx:
         drive = workflow.accept_drive(tx, name="d", filename="d.zip", size=9, object_key="k").id

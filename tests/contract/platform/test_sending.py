@@ -102,7 +102,7 @@ def test_a_certificate_of_another_name_is_not_taken(receiver) -> None:
 
 def test_one_forbidden_address_beside_an_allowed_one_forbids_the_name(receiver) -> None:
     answer = send(f"{receiver.scheme}://hooks.example:{receiver.port}/x", Names("127.0.0.1 127.0.0.2"))
-    assert answer.error == "not sent: 'hooks.example' is not a public address"
+    assert answer.error == "not sent: 'hooks.example' is no public address and no name of one"
     assert receiver.hosts == []
 
 
@@ -112,6 +112,18 @@ def test_another_address_is_tried_where_one_does_not_answer(receiver) -> None:
     assert answer.status == 204
     closed = send(f"{receiver.scheme}://hooks.example:{receiver.port}/x", Names("127.0.0.3"), allow="127.0.0.0/8")
     assert closed.status is None and "ConnectError" in closed.error
+
+
+def test_what_nobody_foresaw_counts_as_an_attempt() -> None:
+    """What is not counted would be made again for ever."""
+
+    def broken(host: str, port: int) -> list[str]:
+        raise ZeroDivisionError
+
+    assert send("https://hooks.example/x", broken).error == "not sent: the service failed (ZeroDivisionError)"
+    guard = Guard(resolver=Names("1.1.1.1"))
+    answer = asyncio.run(sending.attempt(guard, "https://hooks.example/x", ["no secret"], "msg_1", b"{}", 5))
+    assert answer.error is not None and answer.error.startswith("not sent: the service failed")
 
 
 def test_proxies_of_the_environment_are_not_used(receiver, monkeypatch) -> None:

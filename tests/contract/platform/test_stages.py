@@ -92,12 +92,14 @@ def test_scenes_finishing_at_once_publish_once(catalog: Catalog, play, sent) -> 
     assert play.job(job).state is JobState.SUCCEEDED
 
 
-def test_an_expired_lease_is_taken_over_as_the_next_attempt(play, sent) -> None:
-    """A message redelivered after its worker died: the first owner may not write any more."""
+def test_who_lost_its_lease_may_not_write_any_more(play, sent, tidy) -> None:
+    """A message redelivered after its worker died takes nothing over: that would tell nobody and wait for nothing."""
     play.submit(scenes=1)
     message = sent[0]
-    dead = play.take(message, owner="dead", lease=-1)
-    claim = play.take(message, owner="alive")
+    dead = play.take(owner="dead", lease=-1)
+    assert play.take(message, owner="alive") is None
+    tidy(retry_seconds=0)
+    claim = play.take(owner="alive")
     assert (claim.attempt, play.stage(claim.stage_id).lease_owner) == (2, "alive")
     for write in (
         lambda tx: workflow.report(tx, dead, "x", 1, 2, fraction=0.5),
@@ -112,33 +114,60 @@ def test_an_expired_lease_is_taken_over_as_the_next_attempt(play, sent) -> None:
     assert (stage.state, stage.attempt, stage.lease_owner) == (StageState.RUNNING, 2, "alive")
 
 
-def test_a_stage_that_kills_its_workers_is_not_taken_over_for_ever(play, sent) -> None:
-    play.submit(scenes=1)
+@pytest.mark.parametrize("cancelled", [False, True], ids=["", "cancelled-meanwhile"])
+def test_an_owner_may_claim_again_what_it_holds(play, sent, cancelled: bool) -> None:
+    """The answer to its COMMIT was lost: only by asking again does it learn that the stage is its own."""
+    job = play.submit(scenes=1)
     message = sent[0]
-    for attempt in (1, 2, 3):
-        claim = play.take(StageMessage(message.stage_id, max(attempt - 1, 1), message.name, message.queue), lease=-1)
-        assert claim.attempt == attempt
-    assert play.take(StageMessage(message.stage_id, 3, message.name, message.queue)) is None
+    claim = play.take(owner="worker-1")
+    if cancelled:
+        with play.catalog.transaction() as tx:
+            workflow.cancel_job(tx, job)
+    assert play.take(message, owner="worker-2") is None
+    assert play.take(message, owner="worker-1") == claim
+
+
+def test_workers_that_stop_together_do_not_wait_for_each_other_for_ever(catalog: Catalog, play, sent) -> None:
+    """Each holds stages of the same jobs and gives them back, in an order of its own."""
+    jobs = [play.submit(scenes=6) for _ in range(2)]
+    for n, message in enumerate(list(sent)):
+        play.take(message, owner=f"host:{n % 2}:x:1")
+    given, barrier, errors = [], threading.Barrier(2), []
+
+    def stop(worker: int) -> None:
+        barrier.wait()
+        try:
+            given.append(workflow.release_owned(catalog, f"host:{worker}:"))
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=stop, args=(worker,)) for worker in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (given, errors) == ([6, 6], [])
+    assert {state for job in jobs for name, state in play.states(job) if name == "segment"} == {"queued"}
 
 
 def test_heartbeats_keep_a_stage(play, sent) -> None:
     play.submit(scenes=1)
     message = sent[0]
-    play.take(message, owner="host:1:2", lease=-1)
+    claim = play.take(message, owner="host:1:2", lease=-1)
     with play.catalog.transaction() as tx:
         assert workflow.prolong(tx, "host:1:", lambda owner: owner == "host:1:2", 60.0) == 1
-    assert play.take(message, owner="host:1:3") is None
+        assert not workflow.lease_lost(tx, claim.stage_id, RETRY, expired_before=tx.now)
 
 
 def test_the_dead_and_the_neighbours_get_no_heartbeat(play, sent) -> None:
     play.submit(scenes=2)
     first, second = list(sent)
     play.take(first, owner="host:1:2", lease=-1)
-    play.take(second, owner="host:11:2", lease=-1)
+    neighbour = play.take(second, owner="host:11:2", lease=-1)
     with play.catalog.transaction() as tx:
         assert workflow.prolong(tx, "host:1:", lambda owner: False, 60.0) == 0
         assert workflow.prolong(tx, "host:1:", lambda owner: True, 60.0) == 1
-    assert play.take(second, owner="host:1:3") is not None
+        assert workflow.lease_lost(tx, neighbour.stage_id, RETRY, expired_before=tx.now)
 
 
 def test_progress_is_seen(play, sent) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import threading
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from l3ps_platform.catalog import (
     JobRow,
     OutputRow,
     ProjectRow,
-    StageName,
     bundles,
     drives,
     jobs,
@@ -28,68 +26,6 @@ from l3ps_platform.objects import DirectoryStore
 from l3ps_platform.settings import Settings
 
 PROJECT = "prj_default"
-
-
-class House:
-    """Jobs whose stages make real objects under content-addressed keys, and the sweep."""
-
-    def __init__(self, catalog: Catalog, play, sent, store: DirectoryStore) -> None:
-        self.catalog, self.play, self.sent, self.store = catalog, play, sent, store
-
-    def job(self, content: str = "a", *, size: int = 100) -> str:
-        """A finished job over one scene; equal ``content`` means equal outputs."""
-        id = self.play.submit(scenes=1)
-        self.finish(content, size=size)
-        return id
-
-    def finish(self, content: str, *, size: int = 100) -> None:
-        while self.sent:
-            claim = self.play.take()
-            key = f"stages/{PROJECT}/{claim.name.value}-{content}"
-            if claim.name is StageName.PUBLISH:
-                key = f"jobs/{claim.job_id}"
-                self.store.put_bytes(f"{key}/poses.txt", b"poses")
-                self.end(claim, f"{key}/manifest.json")
-                continue
-            self.pin(claim, key)
-            self.store.put_bytes(f"{key}/part-1.bin", b"x" * size)
-            self.end(claim, f"{key}/{outputs.MAIN[claim.name]}", size)
-
-    def pin(self, claim, key: str) -> None:
-        with self.catalog.transaction() as tx:
-            workflow.pin_output(tx, claim, key)
-
-    def end(self, claim, main: str, size: int = 0) -> None:
-        self.store.put_bytes(main, b"{}")
-        with self.catalog.transaction() as tx:
-            workflow.complete(tx, claim, workflow.Cost(1.0), output_key=main)
-            workflow.note_output(tx, main.rpartition("/")[0], size)
-
-    def delete(self, *ids: str) -> None:
-        with self.catalog.transaction() as tx:
-            for id in ids:
-                jobs.delete(tx, id)
-
-    def age(self, row: type, id: str, **since: float) -> None:
-        with self.catalog.transaction() as tx:
-            found = tx.session.get_one(row, id)
-            if row is JobRow:
-                found.finished_at = tx.now - timedelta(**since)
-            else:
-                found.created_at = tx.now - timedelta(**since)
-
-    def sweep(self, **settings) -> dict[str, int]:
-        return workflow.Sweeper(self.catalog, self.store, Settings(**settings)).run_once()
-
-    def groups(self, prefix: str = "") -> set[str]:
-        return {info.key.rpartition("/")[0] for info in self.store.list(prefix)}
-
-
-@pytest.fixture
-def house(catalog: Catalog, play, sent, tmp_path: Path) -> House:
-    store = DirectoryStore(tmp_path / "store", "")
-    store.ensure()
-    return House(catalog, play, sent, store)
 
 
 def stage_keys(content: str) -> set[str]:
@@ -146,8 +82,7 @@ def test_only_a_job_that_is_over_can_be_deleted_and_only_once(house) -> None:
 def test_a_doomed_output_is_refused_until_it_is_gone_and_then_made_anew(house) -> None:
     house.delete(house.job("d"))
     house.store.delete_prefix = _away  # the store goes away between the two halves of the deletion
-    with pytest.raises(StoreUnavailable):
-        house.sweep()
+    assert house.sweep()["outputs"] == 0
     del house.store.delete_prefix
     house.play.submit(scenes=1)
     claim = house.play.take()
@@ -283,7 +218,7 @@ def test_what_nobody_owns_goes_after_a_day_and_what_somebody_owns_stays(house) -
     }
     for key in orphans:
         house.store.put_bytes(f"{key}/file", b"x")
-    lost = house.store.create_multipart("uploads/upl_y/archive")
+    lost = house.store.create_multipart("uploads/upl_y/archive", 5 << 20)
     house.sweep()
     house.sweep()
     assert house.groups() == orphans | stage_keys("a") | {f"jobs/{job}"}, "it may be somebody's in a moment"

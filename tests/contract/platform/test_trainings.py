@@ -1,5 +1,6 @@
 """A training's life in the catalog, on SQLite and PostgreSQL."""
 
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -7,7 +8,7 @@ from alembic import command
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
-from l3ps.errors import Cancelled
+from l3ps.errors import Cancelled, Problem
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Catalog, JobState, StageRow, StageState, annotation_sets, bundles, stages, trainings
 from l3ps_platform.catalog.migrate import _config, upgrade
@@ -130,11 +131,11 @@ def test_a_dead_worker_s_training_goes_on(play, sent, start, see, tidy) -> None:
     assert see(id).state is JobState.SUCCEEDED
 
 
-def test_notes_are_the_owner_s_alone(play, sent, start, see) -> None:
+def test_notes_are_the_owner_s_alone(play, sent, start, see, tidy) -> None:
     id = start()
-    message = sent[0]
-    dead = play.take(message, owner="dead", lease=-1)
-    claim = play.take(message, owner="alive")
+    dead = play.take(owner="dead", lease=-1)
+    tidy(retry_seconds=0)
+    claim = play.take(owner="alive")
     with play.catalog.transaction() as tx:
         workflow.note_training(tx, claim, figures={"loss": 0.5}, log_key="l")
         workflow.note_training(tx, claim, figures={"loss": 0.4})
@@ -194,7 +195,7 @@ class TestAnnotations:
         play.run(done)
         with play.catalog.transaction() as tx:
             annotation_sets.delete(tx, images)
-        assert tidy().archives == 1
+        assert tidy.sweep()["archives"] == 1
         assert not tidy.store.exists("uploads/u/a.zip")
         with play.catalog.reading() as session:
             assert [row.id for row in annotation_sets.page(session)] == [other]
@@ -238,3 +239,41 @@ def test_the_migration_keeps_every_row_and_every_rule(empty_url: str) -> None:
         tx.session.execute(text("DELETE FROM stages WHERE id = 'stg_1'"))
         assert tx.session.scalar(text("SELECT count(*) FROM steps")) == 0
     catalog.dispose()
+
+
+@pytest.mark.parametrize("migrated_url", ["postgresql"], indirect=True)  # SQLite has one lock
+def test_starting_and_retrying_do_not_wait_for_each_other_for_ever(catalog: Catalog, play, start, images, see) -> None:
+    """Both hold the annotations and the model that has the name, in the same order."""
+    id, rejected = start(), play.model(problems=[Problem("no-graph", "m.zip", "it holds none", "Export it again.")])
+    with catalog.transaction() as tx:
+        bundles.lock(tx.session, rejected).name = "m"
+        workflow.cancel_training(tx, id)
+    errors = []
+
+    def retry() -> None:
+        try:
+            with catalog.transaction() as tx:
+                workflow.retry_training(tx, id)
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=retry)
+    with catalog.transaction() as tx:
+        annotation_sets.lock(tx.session, images)
+        thread.start()
+        waiting = text("SELECT 1 FROM pg_locks WHERE NOT granted")
+        while tx.session.execute(waiting).first() is None:
+            pass
+        assert bundles.named(tx.session, "m").id == rejected
+    thread.join()
+    assert not errors
+    assert see(id).state is JobState.QUEUED
+
+
+def test_a_training_whose_annotations_are_gone_cannot_be_run_again(catalog: Catalog, start, images) -> None:
+    id = start()
+    with catalog.transaction() as tx:
+        workflow.cancel_training(tx, id)
+        annotation_sets.delete(tx, images)
+    with pytest.raises(Conflict, match="upload it again"), catalog.transaction() as tx:
+        workflow.retry_training(tx, id)

@@ -218,7 +218,7 @@ def served(tmp_path: Path, redis_url: str) -> Iterator[Callable]:
         context = Context(settings)
         context.store.ensure()
         stop = threading.Event()
-        reconciler = workflow.Reconciler(context.catalog, context.queue, context.store, settings)
+        reconciler = workflow.Reconciler(context.catalog, context.queue, settings)
         thread = threading.Thread(target=reconciler.run, args=(stop,))
         thread.start()
         try:
@@ -233,13 +233,15 @@ def served(tmp_path: Path, redis_url: str) -> Iterator[Callable]:
 
 @pytest.fixture
 def worker(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """Starts real worker processes for a bench: ``worker(bench, queues=…)``; none survives the test."""
+    """Starts real worker processes for a bench: ``worker(bench, queues=…, app=…)``; none survives the test."""
     running: list[subprocess.Popen[bytes]] = []
 
-    def start(bench: Bench, queues: str = "segment,refine", **extra: str) -> subprocess.Popen[bytes]:
+    def start(
+        bench: Bench, queues: str = "segment,refine", app: str = "l3ps_worker.app", **extra: str
+    ) -> subprocess.Popen[bytes]:
         given = bench.settings.model_dump(exclude_unset=True, exclude_none=True)
         environment = os.environ | {f"L3PS_{name.upper()}": str(value) for name, value in given.items() if value != ""}
-        command = [sys.executable, "-m", "celery", "-A", "l3ps_worker.app", "worker", "-Q", queues, "-c", "1"]
+        command = [sys.executable, "-m", "celery", "-A", app, "worker", "-Q", queues, "-c", "1"]
         command += ["--without-gossip", "--without-mingle"]  # a second less to start
         out = (tmp_path / f"worker-{len(running)}.log").open("wb")
         process = subprocess.Popen(

@@ -7,6 +7,7 @@ import json
 import shutil
 import tarfile
 import zipfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ import pytest
 from l3ps.drivelog import open_drive
 from l3ps.evaluate import evaluate_drive
 from l3ps.labels import open_labels, read_poses
+from l3ps.segment import check
 from l3ps_platform import workflow
-from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs
+from l3ps_platform.catalog import DriveState, JobState, ModelState, StageState, jobs, outputs, stages
 from l3ps_platform.errors import CatalogUnavailable, StoreUnavailable
+from l3ps_platform.workflow.planning import enqueue
 from l3ps_worker import runner
 
 
@@ -211,6 +214,26 @@ def test_a_model_whose_graph_does_not_load_is_rejected(direct, fast_model: Path,
     assert "it is no ONNX graph" in direct.model(model).problem["problems"][0]["what"]
 
 
+def test_a_model_whose_trial_the_machine_ends_is_tried_again(direct, fast_model: Path, monkeypatch, tmp_path) -> None:
+    """For memory that others hold, say: nothing that its owner could mend."""
+    killed = tmp_path / "killed"
+    killed.write_text("#!/bin/sh\nkill -KILL $$\n")
+    killed.chmod(0o755)
+    model = direct.upload_model(fast_model)
+    message = direct.sent[0]
+    with monkeypatch.context() as patched:
+        patched.setattr(check.sys, "executable", str(killed))
+        assert direct.step() == "failed"
+    with direct.catalog.reading() as session:
+        stage = stages.get(session, message.stage_id)
+    assert (stage.state, stage.error["cause"], stage.failures) == (StageState.WAITING, "out-of-memory", 1)
+    assert "use one with more" in stage.error["message"]
+    with direct.catalog.transaction() as tx:
+        enqueue(tx, stages.get(tx.session, stage.id))
+    assert direct.run() == ["done"]
+    assert direct.model(model).state is ModelState.READY
+
+
 class TestStopping:
     """A stage ends at its next report when it is to end; nothing of it is left behind."""
 
@@ -287,29 +310,46 @@ def test_what_may_pass_is_tried_again(direct, drive_zip: Path, monkeypatch, erro
     drive = direct.upload_drive(drive_zip)
     assert direct.step() == "failed"
     with direct.catalog.reading() as session:
-        from l3ps_platform.catalog import stages
-
         stage = stages.ingest_of(session, drive_id=drive)
     assert (stage.state, stage.attempt, stage.failures) == (StageState.WAITING, 2, failures)
     assert (stage.error["cause"], stage.finished_at) == (cause, None)
     assert said in stage.error["message"]
 
 
+def test_an_end_that_cannot_be_recorded_is_a_failure_of_the_stage(direct, drive_zip: Path, monkeypatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("the database does not take this")
+
+    monkeypatch.setattr(workflow, "drive_checked", refuse)
+    drive = direct.upload_drive(drive_zip)
+    assert direct.step() == "failed"
+    with direct.catalog.reading() as session:
+        stage = stages.ingest_of(session, drive_id=drive)
+    assert (stage.state, stage.failures, stage.error["cause"]) == (StageState.WAITING, 1, "internal")
+    assert stage.error["message"] == "what it found could not be recorded (ValueError)"
+
+
 def test_what_is_done_waits_for_a_catalog_that_is_away(direct, drive_zip: Path, monkeypatch) -> None:
-    """The work is not lost with the first commit that fails."""
+    """The work is not lost with the first commit that fails, nor is a claim whose answer alone is lost."""
     drive, real, failures = direct.upload_drive(drive_zip), direct.context.catalog, [1, 2]
+    unanswered = [1]
 
     class Away:
-        """The catalog, away for two transactions once the stage's work is done."""
+        """The catalog, away after its first commit, and for two transactions once the stage's work is done."""
 
         def __getattr__(self, name: str):
             return getattr(real, name)
 
+        @contextmanager
         def transaction(self):
             if done and failures:
                 failures.pop()
                 raise CatalogUnavailable("the catalog does not answer")
-            return real.transaction()
+            with real.transaction() as tx:
+                yield tx
+            if unanswered:
+                unanswered.pop()
+                raise CatalogUnavailable("the catalog does not answer")
 
     done: list[bool] = []
     work, steps = runner.WORK[runner.StageName.INGEST]
@@ -322,7 +362,7 @@ def test_what_is_done_waits_for_a_catalog_that_is_away(direct, drive_zip: Path, 
     monkeypatch.setitem(runner.WORK, runner.StageName.INGEST, (noted, steps))
     direct.context.catalog = Away()
     assert direct.step() == "done"
-    assert not failures
+    assert not failures + unanswered
     assert direct.drive(drive).state is DriveState.READY
 
 

@@ -3,13 +3,15 @@
 import hashlib
 import os
 import signal
+import socket
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import httpx
 import pytest
 
-from l3ps_platform.catalog import JobState, StageName, StageState
+from l3ps_platform import workflow
+from l3ps_platform.catalog import JobState, ModelState, StageName, StageState, stages
 
 pytestmark = pytest.mark.services
 
@@ -73,6 +75,24 @@ def test_a_job_survives_all_that_can_happen_to_its_workers(served, worker, short
         worker(bench)
         assert bench.finished(job).state is JobState.SUCCEEDED
         assert next(s for s in bench.stages(job) if s.id == stage.id).attempt == 3
+
+
+def test_a_worker_holds_what_it_works_on_and_takes_nobody_s(served, worker, fast_model: Path, drive_zip: Path) -> None:
+    """A child that cannot record how its stage ended lets go of it; and a worker that shares its host name with another
+    one, in a container whose processes it does not see, takes that one's stages neither at its start nor later.
+    """
+    with served(heartbeat_seconds=0.2) as bench:
+        drive = bench.upload_drive(drive_zip)
+        neighbour = f"{socket.gethostname()}:{1 << 23}:other:{1 << 23}"
+        with bench.catalog.transaction() as tx:
+            check = stages.ingest_of(tx.session, drive_id=drive)
+            assert workflow.claim(tx, check.id, check.attempt, neighbour, lease_seconds=3600.0)
+        model = bench.upload_model(fast_model)
+        worker(bench, app="unrecordable", PYTHONPATH=str(Path(__file__).parent))
+        bench.until(lambda: bench.model(model).state is ModelState.READY)
+        with bench.catalog.reading() as session:
+            done, held = stages.ingest_of(session, model_id=model), stages.get(session, check.id)
+        assert (done.attempt, held.state, held.lease_owner) == (2, StageState.RUNNING, neighbour)
 
 
 def pulse_of(worker_pid: int) -> int | None:

@@ -127,6 +127,8 @@ class Service:
             number, _, signature = rest.partition("?")
             if signature != self.signature:
                 return 403, {"detail": "The URL has expired."}
+            if self.uploads[upload].get("joined"):
+                return 404, None, {}, b"<Code>NoSuchUpload</Code>"
             self.uploads[upload]["parts"][int(number)] = body
             return 200, None, {"ETag": f'"{hashlib.md5(body).hexdigest()}"'}
         document = json.loads(body) if body else {}
@@ -150,7 +152,8 @@ class Service:
             return 200, {"id": "drv_1", "name": document.get("name", "log")}
         parts = self.uploads[id]["parts"].items()
         received = [{"number": n, "size": len(data), "etag": hashlib.md5(data).hexdigest()} for n, data in parts]
-        return 200, self._document(id) | {"received": received}
+        joined = self.uploads[id].get("joined", False)
+        return 200, self._document(id) | {"received": [] if joined else received, "joined": joined}
 
     def _document(self, id):
         upload = self.uploads[id]

@@ -1,6 +1,7 @@
 """Files on their way down: there only when whole, checked, gone on with at the byte where they broke off."""
 
 import hashlib
+import json
 import os
 import re
 import signal
@@ -189,7 +190,7 @@ def test_an_url_that_never_works_is_a_refusal(tmp_path):
             store.client.labels.download("job_1", tmp_path)
 
 
-@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../x", "", "a\\..\\x"])
+@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../x", "", "a\\..\\x", "C:x"])
 def test_no_listing_makes_a_download_write_elsewhere(tmp_path, path):
     with store_of(good=b"0123") as store:
         store.files[path] = b"evil"
@@ -244,10 +245,18 @@ def test_filters_and_jobs_go_into_the_query(server, client, tmp_path):
     client.labels.download("job_1", tmp_path, scenes=["a", "b"], side="refined")
     client.labels.archive(["job_1", "job_2"], tmp_path / "all.tar", format="nuscenes")
     assert [path.partition("?")[2] for _, path, *_ in server.seen] == [
-        "scene=a&side=refined",
-        "scene=b&side=refined",
+        "scene=a&side=refined&limit=1000",
+        "scene=b&side=refined&limit=1000",
         "format=nuscenes&job=job_1&job=job_2",
     ]
+
+
+def test_a_listing_is_fetched_page_by_page(server, client):
+    pages = [{"files": ["a", "b"], "next": "2"}, {"files": ["c"], "next": "3"}, {"files": ["d"]}]
+    server.script += [(200, {}, json.dumps(page).encode(), None) for page in pages]
+    assert client.labels.list("job_1", scene="x")["files"] == ["a", "b", "c", "d"]
+    asked = [path.partition("?")[2] for _, path, *_ in server.seen]
+    assert asked == ["scene=x&limit=1000", "scene=x&limit=1000&cursor=2", "scene=x&limit=1000&cursor=3"]
 
 
 def test_how_often_is_bounded(tmp_path):

@@ -1,19 +1,23 @@
 """Files on their way up: in parts, checked, gone on with after a death, and nothing left of what was refused."""
 
+import fcntl
 import hashlib
 import os
 import signal
 import subprocess
 import sys
 import threading
+from contextlib import ExitStack
 
 import pytest
 
-from l3ps_client import Client, Damaged, InvalidRequest, NotFound, Retry, Unreachable
+from l3ps_client import Client, Conflict, Damaged, InvalidRequest, NotFound, Refused, Retry, Unreachable
+from l3ps_client._ledger import Ledger
 
 AT_ONCE = Retry(first=0.0)
 PARTS = 6
 DOWN = (503, {"detail": "The object store does not answer."}, {"Retry-After": "0"})
+BUSY = (409, {"type": "urn:l3ps:problem:request-in-progress", "detail": "In progress."}, {"Retry-After": "0"})
 
 
 @pytest.fixture
@@ -216,6 +220,88 @@ def test_an_upload_that_is_complete_is_not_sent_again(service, client, file):
     assert service.puts() == []
 
 
+def test_an_upload_that_was_joined_and_not_recorded_is_completed_and_not_sent_again(service, client, file):
+    """The service was killed between the store's work and its own commit."""
+    service.faults.append(only(lambda _, path: path.endswith("/complete"), DOWN))
+    with pytest.raises(Unreachable):
+        client.drives.upload(file, name="morning")
+    service.faults.clear()
+    service.seen.clear()
+    service.uploads["upl_1"]["joined"] = True
+    told = []
+    assert client.drives.upload(file, name="morning", progress=lambda *done: told.append(done))["id"] == "drv_1"
+    assert service.puts() == []
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert service.uploads["upl_1"]["completion"] == {"name": "morning", "sha256": sha256}
+    assert told == [(file.stat().st_size,) * 2]
+
+
+def test_a_completion_that_takes_long_is_waited_for(service, client, file):
+    """Its answer is lost to a proxy's patience; the service says that it is still at it, more often than one tries."""
+    answers = [BUSY] * 20 + [(504,)]
+    service.faults.append(lambda _, path: answers.pop() if path.endswith("/complete") and answers else None)
+    assert client.drives.upload(file)["id"] == "drv_1"
+    assert not [path for method, path in service.seen if method == "DELETE"]
+
+
+def test_a_completion_that_takes_too_long_is_left_for_the_next_call(service, file, tmp_path):
+    service.faults.append(only(lambda _, path: path.endswith("/complete"), BUSY))
+    hasty = Retry(first=0.0, in_progress=0.0)
+    with Client(service.url, retry=hasty, state=tmp_path / "notes") as client:
+        with pytest.raises(Conflict):
+            client.drives.upload(file)
+        assert service.uploads["upl_1"]["state"] == "open"
+        service.faults.clear()
+        assert client.drives.upload(file)["id"] == "drv_1"
+    assert service.whole("upl_1") == file.read_bytes() and len(service.puts()) == PARTS
+
+
+def test_an_announcement_in_progress_elsewhere_is_found_by_the_next_call(service, file, tmp_path):
+    """Its process was killed after the commit, and its lease is longer than a client cares to wait."""
+    original = service._done
+
+    def die(handler, path, body):
+        answer = original(handler, path, body)
+        return BUSY if path == "/v1/uploads" else answer
+
+    service._done = die
+    hasty = Retry(first=0.0, in_progress=0.0)
+    with Client(service.url, retry=hasty, state=tmp_path / "notes") as client:
+        with pytest.raises(Conflict):
+            client.drives.upload(file)
+        service._done = original
+        client.drives.upload(file)
+    assert list(service.uploads) == ["upl_1"]
+
+
+@pytest.mark.parametrize("status", [401, 403, 408, 421])
+@pytest.mark.parametrize("where", ["PUT", "complete"])
+def test_what_is_no_fault_of_the_upload_keeps_what_has_arrived(service, client, file, tmp_path, status, where):
+    """Such as a key that was revoked or rotated in the middle of it."""
+    at = part(6) if where == "PUT" else lambda method, path: path.endswith("/complete")
+    service.faults.append(only(lambda method, path: at(method, path) or path.endswith("/parts"), (status, {})))
+    with pytest.raises(Refused):
+        client.drives.upload(file, parallel=1)
+    assert service.uploads["upl_1"]["state"] == "open" and notes(tmp_path)
+    service.faults.clear()
+    service.seen.clear()
+    client.drives.upload(file)
+    assert service.whole("upl_1") == file.read_bytes()
+    assert service.puts() == ([6] if where == "PUT" else [])
+
+
+def test_parts_that_are_missing_at_the_completion_are_sent_by_the_next_call(service, client, file):
+    missing = 422, {"type": "urn:l3ps:problem:invalid-parts", "detail": "1 of 6 parts have not arrived: 3."}
+    service.faults.append(only(lambda _, path: path.endswith("/complete"), missing))
+    with pytest.raises(InvalidRequest):
+        client.drives.upload(file)
+    service.faults.clear()
+    service.seen.clear()
+    del service.uploads["upl_1"]["parts"][3]
+    client.drives.upload(file)
+    assert service.puts() == [3] and service.whole("upl_1") == file.read_bytes()
+
+
 def test_interrupted_with_abort_on_error_nothing_stays(service, client, file, tmp_path):
     service.faults.append(only(part(5), DOWN))
     with pytest.raises(Unreachable):
@@ -268,6 +354,26 @@ def test_two_processes_with_the_same_file_do_not_share_an_upload(service, client
     go.set()
     first.join(30)
     assert service.whole("upl_1") == service.whole("upl_2") == file.read_bytes()
+
+
+def test_a_note_that_another_process_deletes_in_this_moment_is_made_anew(tmp_path, monkeypatch):
+    """The other one ends between our opening and our locking the file: what we lock must be the file that is there."""
+    ledger, flock = Ledger(tmp_path), fcntl.flock
+    with ExitStack() as other:
+        other.enter_context(ledger.note(file="morning.tar"))
+
+        def late(file, how):
+            monkeypatch.undo()
+            other.close()
+            flock(file, how)
+
+        monkeypatch.setattr(fcntl, "flock", late)
+        with ledger.note(file="morning.tar") as note:
+            assert note.lasting
+            note.save(path=str(tmp_path / "morning.tar"), upload_id="upl_1")
+            with ledger.note(file="morning.tar") as third:
+                assert not third.lasting
+        assert ledger.of_file(tmp_path / "morning.tar") == [note.facts]
 
 
 def test_a_killed_process_leaves_a_note_and_the_next_one_goes_on(service, client, file, tmp_path):

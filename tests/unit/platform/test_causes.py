@@ -4,7 +4,7 @@ import errno
 
 import pytest
 
-from l3ps.errors import Cancelled, DriveLogError, Problem, ProcessingError
+from l3ps.errors import Cancelled, DriveLogError, Problem, ProcessingError, Starved
 from l3ps_platform.errors import CatalogUnavailable, LeaseLost, StoreUnavailable
 from l3ps_platform.workflow.causes import Cause, cause_of, failure, stored_cause
 
@@ -29,6 +29,8 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
         (LeaseLost("gone"), Cause.LEASE_LOST),
         (DriveLogError(Problem("c", "w", "x", "r")), Cause.BAD_INPUT),
         (ProcessingError("odometry diverged"), Cause.PROCESSING),
+        (Starved("the trial was killed", "memory"), Cause.OUT_OF_MEMORY),
+        (Starved("the trial had no processor", "time"), Cause.TIMEOUT),
         (Cancelled("stop"), Cause.CANCELLED),
         (ZeroDivisionError(), Cause.INTERNAL),
         (OSError(errno.EIO, "broken disk"), Cause.INTERNAL),

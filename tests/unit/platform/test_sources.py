@@ -43,12 +43,23 @@ def test_a_source_covers_what_lies_below_its_prefix_by_whole_segments(place, all
     assert (found is not None) is allowed
 
 
-def test_a_source_may_be_one_projects_alone_and_the_narrowest_counts():
+def test_what_is_one_projects_alone_is_no_others_through_a_wider_source():
     settings = Settings(sources=f"{URL}&project=prj_1,s3://other:k@minio/fleet")
-    wide = find_source(settings, Reference.parse("s3://fleet/logs/2026/a"), "prj_2")
-    narrow = find_source(settings, Reference.parse("s3://fleet/logs/2026/a"), "prj_1")
-    assert wide is not None and wide.location.access_key == "other"
-    assert narrow is not None and narrow.location.access_key == "key"
+
+    def key(place: str, project: str) -> str | None:
+        found = find_source(settings, Reference.parse(f"s3://{place}"), project)
+        return found and found.location.access_key
+
+    assert (key("fleet/logs/2026/a", "prj_1"), key("fleet/logs/2026/a", "prj_2")) == ("key", None)
+    assert (key("fleet/other", "prj_1"), key("fleet/other", "prj_2")) == ("other", "other")
+    assert (key("fleet", "prj_1"), key("fleet", "prj_2")) == ("other", None), "a place that contains it"
+
+
+def test_a_source_may_be_several_projects():
+    settings = Settings(sources=f"{URL}&project=prj_1,{URL}&project=prj_2")
+    place = Reference.parse("s3://fleet/logs/2026/a")
+    found = [find_source(settings, place, f"prj_{n}") for n in (1, 2, 3)]
+    assert [source and source.project_id for source in found] == ["prj_1", "prj_2", None]
 
 
 @pytest.mark.parametrize(

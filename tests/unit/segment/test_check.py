@@ -1,6 +1,9 @@
 """Bundles from strangers: what is refused, why, and that nothing but the trial's process comes to harm."""
 
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import onnx
@@ -8,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
-from l3ps.errors import Cancelled, ModelError, ProcessingError
+from l3ps.errors import Cancelled, ModelError, ProcessingError, Starved
 from l3ps.segment import check
 from l3ps.segment.bundle import ModelBundle
 from l3ps.segment.check import check_bundle
@@ -229,3 +232,30 @@ def test_a_check_that_does_not_work_is_not_the_models_fault(write_bundle, monkey
     monkeypatch.setattr(check.sys, "executable", "/bin/false")
     with pytest.raises(ProcessingError, match="did not work"):
         check_bundle(write_bundle())
+
+
+@pytest.mark.parametrize(
+    ("does", "lack", "said"),
+    [
+        ("kill -KILL $$", "memory", "free memory"),
+        ("kill -TERM $$", "time", "SIGTERM"),
+        ("exec sleep 600", "time", "hardly any processor time"),
+    ],
+    ids=["killed", "stopped", "never-served"],
+)
+def test_what_the_machine_does_to_a_trial_is_not_the_models_fault(
+    write_bundle, monkeypatch, tmp_path, does, lack, said
+):
+    interpreter = tmp_path / "interpreter"
+    interpreter.write_text(f"#!/bin/sh\n{does}\n")
+    interpreter.chmod(0o755)
+    monkeypatch.setattr(check.sys, "executable", str(interpreter))
+    with pytest.raises(Starved, match=said) as caught:
+        check_bundle(write_bundle(), seconds=0.2)
+    assert caught.value.lack == lack
+
+
+def test_a_trial_out_of_its_own_time_says_so(write_bundle):
+    """Its limit of processor time ends it in another way than the kernel does when memory is short."""
+    spin = "import os; from l3ps.segment.trial import limit; limit(8 << 30, 0)\nwhile True: pass"
+    assert subprocess.run([sys.executable, "-c", spin], check=False, timeout=60).returncode == -signal.SIGXCPU

@@ -155,3 +155,21 @@ def test_half_an_entry_that_nobody_wants_again_goes_too(tmp_path: Path) -> None:
     (tmp_path / "cache" / "drive-1" / "new").write_bytes(b"half")
     with Scratch(tmp_path, 1000).entry("drive-2", writing(b"whole")):
         assert not (tmp_path / "cache" / "drive-1").exists()
+
+
+def test_a_dead_worker_is_told_from_a_living_one(tmp_path: Path) -> None:
+    """By a lock and not by a number: process ids and host names come again."""
+    live = "import sys\nfrom pathlib import Path\nfrom l3ps_worker.scratch import Scratch\n"
+    live += f"with Scratch(Path({str(tmp_path)!r}), 0).alive('host:7:a:'):\n    print('alive', flush=True), input()"
+    scratch = Scratch(tmp_path, 0)
+    with subprocess.Popen([sys.executable, "-c", live], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"alive\n"
+        with scratch.alive("host:7:b:"):
+            assert list(scratch.dead_workers()) == []
+        other.kill()
+        other.wait()
+    dead = scratch.dead_workers()
+    assert next(dead) in ("host:7:a:", "host:7:b:")
+    dead.close()  # the caller failed: it is told of again
+    assert sorted(scratch.dead_workers()) == ["host:7:a:", "host:7:b:"]
+    assert list(scratch.dead_workers()) == []

@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field
 
 from l3ps_api.problems import ErrorItem, stored_items
 from l3ps_platform.catalog import DriveRow, DriveState
+from l3ps_platform.workflow import MAX_PROBLEMS, problem_count
 
 
 class DriveScene(BaseModel):
@@ -40,8 +41,10 @@ class Drive(BaseModel):
     state: DriveState
     problems: list[ErrorItem] = Field(
         default_factory=list,
-        description="Why it was rejected; or, of a ready drive, the scans that a job can skip and warnings.",
+        description="Why it was rejected; or, of a ready drive, the scans that a job can skip and warnings. The worst "
+        f"come first, and not more than {MAX_PROBLEMS}.",
     )
+    problem_count: int = Field(default=0, description="How many problems there are in all.")
     info: DriveInfo | None = None
     created_at: datetime
 
@@ -58,7 +61,8 @@ class Drive(BaseModel):
             source=row.source,
             format=row.format,
             state=row.state,
-            problems=stored_items(stored.get("problems")),
+            problems=stored_items(stored.get("problems", [])[:MAX_PROBLEMS]),
+            problem_count=problem_count(row.problem),
             info=DriveInfo.model_validate(row.info) if row.info else None,
             created_at=row.created_at,
         )

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import structlog
 from fastapi.concurrency import run_in_threadpool
 
+from l3ps_api.places import Places
 from l3ps_platform.catalog import Catalog, EventRow, events, watching
 from l3ps_platform.errors import PlatformError
 
@@ -26,6 +27,7 @@ log = structlog.get_logger(__name__)
 TICK_SECONDS = 0.5
 RING = 2000
 PAGE = 500
+_REMEDY = "Close some, follow the project by one stream, or ask for the jobs' states instead."
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +61,12 @@ class EventHub:
         head: events up to this number are in the log or the ring; -1 while nothing is known yet.
         listeners: how many streams there are.
         closing: the process stops and so shall the streams.
+        places: those of the streams.
     """
 
-    def __init__(self, catalog: Catalog) -> None:
+    def __init__(self, catalog: Catalog, limit: int = 500) -> None:
         self._catalog = catalog
+        self.places = Places(limit, "too-many-streams", "streams", _REMEDY)
         self._ring: deque[Entry] = deque()
         self._watched: Counter[str] = Counter()
         self._progress: dict[str, str] = {}

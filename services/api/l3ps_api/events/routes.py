@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
@@ -24,6 +25,14 @@ def _hub(request: Request) -> EventHub:
 
 
 HubDep = Annotated[EventHub, Depends(_hub)]
+
+
+async def _place(hub: HubDep, principal: PrincipalDep) -> AsyncIterator[None]:
+    with hub.places.hold(principal.project_id):
+        yield  # until the answer has been sent
+
+
+_PLACED = [Depends(_place)]
 LastEventId = Annotated[
     int | None,
     Header(
@@ -44,6 +53,7 @@ _DOCUMENTS = {EventStream.media_type: {"schema": {"type": "object"}}}
     "/jobs/{job_id}/events",
     status_code=200,
     response_class=EventStream,
+    dependencies=_PLACED,
     responses={
         200: {
             "model": Job | Event | JobProgress,
@@ -57,7 +67,6 @@ _DOCUMENTS = {EventStream.media_type: {"schema": {"type": "object"}}}
 )
 async def follow_job(job_id: str, services: ServicesDep, hub: HubDep, last_event_id: LastEventId = None) -> Response:
     """Follow a job. A stream that breaks is resumed with the last message's id, and nothing is missed."""
-    service.admit(hub, services.settings.event_streams)
     feed = await run_in_threadpool(service.of_job, services, job_id, last_event_id)
     return Response(status_code=204) if feed is None else EventStream(told(hub, feed))
 
@@ -66,6 +75,7 @@ async def follow_job(job_id: str, services: ServicesDep, hub: HubDep, last_event
     "/events",
     status_code=200,
     response_class=EventStream,
+    dependencies=_PLACED,
     responses={
         200: {
             "model": Event,
@@ -90,6 +100,5 @@ async def follow_project(
     last_event_id: LastEventId = None,
 ) -> Response:
     """Follow all that happens in the project. A stream that breaks is resumed with the last message's id."""
-    service.admit(hub, services.settings.event_streams)
     feed = await run_in_threadpool(service.of_project, services, principal.project_id, kinds, subject, last_event_id)
     return EventStream(told(hub, feed))

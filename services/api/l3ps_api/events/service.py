@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from fastapi.sse import format_sse_event
 
-from l3ps_api.events.hub import PAGE, Entry, EventHub
+from l3ps_api.events.hub import PAGE, Entry
 from l3ps_api.events.stream import Feed
 from l3ps_api.jobs import service as job_service
-from l3ps_api.problems import ApiProblem, ErrorItem, invalid
+from l3ps_api.problems import invalid
 from l3ps_api.services import Services
 from l3ps_platform.catalog import Catalog, EventKind, events, jobs
 from l3ps_platform.catalog.kinds import select_kinds
@@ -30,8 +30,9 @@ def of_job(services: Services, job_id: str, last: int | None) -> Feed | None:
         known = events.last_seq(session)  # after the state: its event is among these
     if last is not None and last <= known:
         return None if over and not read(last) else Feed(last, read, wants, job_id)
-    snapshot = job_service.get(services, job_id).model_dump_json()
-    opening = format_sse_event(event="snapshot", data_str=snapshot, id=str(known))
+    # The document itself is the one that is kept for all who ask: a stream holds no copy of its 2 MB.
+    snapshot = job_service.encoded(services, job_id)
+    opening = (f"event: snapshot\nid: {known}\ndata: ".encode(), snapshot, b"\n\n")
     return Feed(known, read, wants, job_id, opening, over)
 
 
@@ -55,16 +56,7 @@ def of_project(services: Services, project_id: str, kinds: str | None, subject: 
         return Feed(last, read, wants)
     # So that a client that is cut off before the first event knows where to go on.
     opening = format_sse_event(event="open", data_str=f'{{"seq": {known}}}', id=str(known))
-    return Feed(known, read, wants, opening=opening)
-
-
-def admit(hub: EventHub, limit: int) -> None:
-    """Raise a 503 problem where there are too many streams already."""
-    if hub.listeners >= limit:
-        what, remedy = f"{limit} streams are open already", "Try again later, or ask for the job's state instead."
-        items = [ErrorItem(where="path", what=what, remedy=remedy)]
-        detail = f"Of this process {what}. {remedy}"
-        raise ApiProblem(503, "too-many-streams", "Too many streams", detail, items, headers={"Retry-After": "5"})
+    return Feed(known, read, wants, opening=(opening,))
 
 
 def _read(

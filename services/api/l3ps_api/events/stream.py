@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import structlog
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
-from starlette.types import Message, Send
 
 from l3ps_api.events.hub import PAGE, Entry, EventHub
+from l3ps_api.patience import PatientResponse
 from l3ps_platform.catalog.kinds import JOB_OVER
 from l3ps_platform.errors import PlatformError
 
@@ -23,8 +22,8 @@ HEARTBEAT_SECONDS = 15.0
 RETRY_MS = 2000
 LIFE_SECONDS = 900.0
 """A stream lives no longer: whose key was revoked meanwhile does not come back, others go on where they were."""
-SEND_SECONDS = 30.0
-"""A client that takes nothing for so long, its buffers and ours full, is hung up on."""
+PIECE = 1 << 16
+"""Bytes of an opening that are handed on at a time: what a slow client has not taken yet is not copied."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +35,7 @@ class Feed:
         read: fetches the events after a number from the log, at most ``PAGE``, only those it wants.
         wants: whether it wants an event of the ring.
         job_id: the job whose progress it is shown, and with whose end the stream ends.
-        opening: what it is sent first.
+        opening: what it is sent first, in parts.
         over: there is nothing to follow.
     """
 
@@ -44,11 +43,11 @@ class Feed:
     read: Callable[[int], list[Entry]]
     wants: Callable[[Entry], bool]
     job_id: str | None = None
-    opening: bytes = b""
+    opening: tuple[bytes, ...] = ()
     over: bool = False
 
 
-class EventStream(StreamingResponse):
+class EventStream(PatientResponse):
     """The answer: never kept by anyone on the way, and ended when the client does not take it.
 
     Not FastAPI's class of this purpose, which wants routes that yield: ours says before the stream begins whether there
@@ -60,22 +59,14 @@ class EventStream(StreamingResponse):
     def __init__(self, content: AsyncIterator[bytes]) -> None:
         super().__init__(content, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
 
-    async def stream_response(self, send: Send) -> None:
-        """Send all there is, each piece within ``SEND_SECONDS``."""
-
-        async def patiently(message: Message) -> None:
-            async with asyncio.timeout(SEND_SECONDS):
-                await send(message)
-
-        try:
-            await super().stream_response(patiently)
-        except TimeoutError:
-            log.info("hung up on a client that takes nothing")
-
 
 async def told(hub: EventHub, feed: Feed) -> AsyncIterator[bytes]:
     """The stream's bytes. Ends with the job, in good time, when the process stops, or when the log cannot be read."""
-    yield format_sse_event(retry=RETRY_MS) + feed.opening
+    yield format_sse_event(retry=RETRY_MS)
+    for part in feed.opening:
+        for at in range(0, len(part), PIECE):
+            yield part[at : at + PIECE]
+    feed, part = replace(feed, opening=()), b""  # held no longer than it takes to send
     if feed.over:
         return
     cursor, shown = feed.cursor, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import structlog
 from sqlalchemy.orm import Session
@@ -18,7 +19,7 @@ from l3ps_api.sources import permitted
 from l3ps_platform.catalog import JobRow, JobState, StageRow, StepRow, bundles, drives, jobs, quotas, stages
 from l3ps_platform.catalog.requests import note_result
 from l3ps_platform.errors import Conflict
-from l3ps_platform.workflow import accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
+from l3ps_platform.workflow import MAX_PROBLEMS, accept_source, cancel_job, outputs_to_keep, retry_job, submit_job
 
 log = structlog.get_logger(__name__)
 
@@ -27,6 +28,8 @@ _STEPS = (
     *("features", "train", "export", "validate"),
 )
 """The order in which a stage takes its steps, for showing them; the catalog keeps them by name."""
+_LOOKS = 16
+"""Objects looked for at a time. Of a job whose every scene failed there may be 850."""
 
 
 def create(services: Services, project_id: str, request: JobRequest) -> Job:
@@ -44,6 +47,7 @@ def create(services: Services, project_id: str, request: JobRequest) -> Job:
     except InputError as error:
         found = error.problems
         count = "one problem" if len(found) == 1 else f"{len(found)} problems"
+        count = f"at least {count}" if len(found) == MAX_PROBLEMS else count
         skippable = all(problem.severity == "scan" for problem in found)
         remedy = (
             "Send skip_bad_scans to label the good scans." if skippable else "Correct the input and upload it again."
@@ -104,11 +108,15 @@ def cancel(services: Services, job_id: str) -> Job:
 
 
 def retry(services: Services, job_id: str) -> Job:
-    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected."""
+    """Run a failed or cancelled job again. NotFound, Conflict for another; 422 when its drive or model was rejected;
+    429 where as many are under way as may be."""
     with services.catalog.reading() as session:
+        check_active_jobs(services, session)
         wanted = outputs_to_keep(session, job_id)
-    gone = [key for key in wanted if not services.store.exists(key)]
+    with ThreadPoolExecutor(_LOOKS) as pool:
+        gone = [key for key, there in zip(wanted, pool.map(services.store.exists, wanted), strict=True) if not there]
     with services.catalog.transaction() as tx:
+        check_active_jobs(services, tx.session)
         retry_job(tx, job_id, gone)
         note_result(tx.session, "jobs", job_id)
     return get(services, job_id)

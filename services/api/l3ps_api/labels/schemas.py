@@ -7,6 +7,10 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 Side = Literal["primal", "refined"]
+ALL_AT_ONCE = 10_000
+"""Files listed where no limit is named: a quarter of a second's work."""
+MOST_AT_ONCE = 1000
+"""Files on a page."""
 
 
 class LabelFile(BaseModel):
@@ -20,8 +24,9 @@ class LabelFile(BaseModel):
 
 
 class LabelFiles(BaseModel):
-    """A finished job's files in one format."""
+    """A finished job's files in one format, or a page of them."""
 
     job_id: str
     format: str
     files: list[LabelFile]
+    next: str | None = Field(default=None, description="Cursor of the next page, absent on the last.")

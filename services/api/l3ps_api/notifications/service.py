@@ -9,6 +9,7 @@ from urllib.parse import unquote_plus
 import structlog
 
 from l3ps_api.notifications.schemas import Noted, Notification, Record
+from l3ps_api.problems import too_large
 from l3ps_api.services import Services
 from l3ps_platform.catalog import RuleRow, rules
 from l3ps_platform.objects import Reference, find_source
@@ -17,12 +18,14 @@ from l3ps_platform.workflow import settle_arrivals
 log = structlog.get_logger(__name__)
 
 ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.zst", ".tzst")
+MAX_ARRIVALS = 2000
+"""Recorded in one transaction, which on SQLite is the only one that writes: a tenth of a second's work."""
 _SECONDS = 0.5
 """For which an answer waits for jobs to be made; what is left then the reconciler does."""
 
 
 def take(services: Services, project_id: str, notification: Notification) -> Noted:
-    """Record what met a rule, for good, and make jobs of it."""
+    """Record what met a rule, for good, and make jobs of it. 413 for more than can be recorded at once."""
     created = [record for record in notification.records if _is_creation(record.event)]
     with services.catalog.reading() as session:
         known_rules = rules.of_buckets(session, [record.s3.bucket.name for record in created])
@@ -33,6 +36,9 @@ def take(services: Services, project_id: str, notification: Notification) -> Not
         met += bool(matches)
         for match in matches:
             found.setdefault((match[0].id, match[1]), match)
+        if len(found) > MAX_ARRIVALS:
+            what = f"its objects meet more than {MAX_ARRIVALS} times one of the project's rules"
+            raise too_large("Records", what, "Send fewer records at a time, or have fewer rules meet one object.")
     with services.catalog.transaction() as tx:
         new = rules.note(tx, list(found.values()))
     if new:

@@ -10,15 +10,21 @@ from l3ps_api.sources import permitted
 from l3ps_platform.catalog import bundles, rules
 from l3ps_platform.errors import Conflict
 
+MAX_RULES = 50
+"""In a project: each object that a notification tells of is held against them all."""
 _OWN = {"name", "bucket", "prefix", "suffix"}
 
 
 def create(services: Services, project_id: str, request: RuleRequest) -> Rule:
-    """A new rule. NotFound for its model, 403 for a place that is no source, 409 for a name that is taken."""
+    """A new rule. NotFound for its model, 403 for a place that is no source, 409 for a name that is taken or for too
+    many."""
     place = permitted(services, project_id, f"s3://{request.bucket}/{request.prefix.strip('/')}", "prefix")
     settings = request.model_dump(exclude=_OWN)
     try:
         with services.catalog.transaction() as tx:
+            if rules.count(tx.session) >= MAX_RULES:
+                detail = f"The project has {MAX_RULES} rules, which is as many as there can be. Delete one first."
+                raise conflict("too-many-rules", "Too many rules", detail, where="name", remedy="Delete one first.")
             bundles.by_name(tx.session, request.model)
             row = rules.add(
                 tx, name=request.name, bucket=place.bucket, prefix=place.path, suffix=request.suffix, settings=settings

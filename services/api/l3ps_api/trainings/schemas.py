@@ -15,6 +15,9 @@ from l3ps_platform.catalog import AnnotationsRow, JobState, ModelRow, TrainingRo
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 PRINTABLE = r"^[^\x00-\x1f\x7f]+$"
 """Control characters are nobody's name: PostgreSQL refuses some, and terminals obey others."""
+Label = Annotated[str, StringConstraints(max_length=100, pattern=PRINTABLE)]
+Key = Annotated[int, Field(ge=0, lt=1 << 31)] | Label
+"""What stands for a class: its number or name in the annotations."""
 Side = Annotated[int, Field(ge=32, le=4096)]
 AnnotationFormat = Literal["auto", "plain", "cityscapes", "coco", "nuimages"]
 
@@ -22,10 +25,10 @@ AnnotationFormat = Literal["auto", "plain", "cityscapes", "coco", "nuimages"]
 class AnnotatedClass(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    id: int | str | None = Field(default=None, description="Number or name in the annotations; default: the category.")
-    category: str | None = Field(default=None, description="The same, of formats that name them; default: the name.")
-    name: str = Field(min_length=1, max_length=100, pattern=PRINTABLE)
-    nuscenes: str | int | None = Field(
+    id: Key | None = Field(default=None, description="Number or name in the annotations; default: the category.")
+    category: Label | None = Field(default=None, description="The same, of formats that name them; default: the name.")
+    name: Label
+    nuscenes: Key | None = Field(
         default=None,
         description="Class of Panoptic nuScenes that it counts as, by name or number, `void` for none; may be left out "
         "where the name says it.",
@@ -38,7 +41,7 @@ class Classes(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     classes: Annotated[list[AnnotatedClass], Field(min_length=1, max_length=1000)]
-    void: list[int | str] = Field(default_factory=list, max_length=1000, description="What is not annotated.")
+    void: list[Key] = Field(default_factory=list, max_length=1000, description="What is not annotated.")
 
 
 class TrainingSettings(BaseModel):
@@ -87,7 +90,7 @@ class TrainingSummary(BaseModel):
     name: str = Field(description="Of the model.")
     annotations: AnnotationsRef
     validation: AnnotationsRef | None = None
-    settings: dict[str, Any] = Field(description="As they were asked for.")
+    settings: dict[str, Any] = Field(description="As they were asked for; in a list without `classes`.")
     state: JobState
     cancel_requested: bool
     progress: float = Field(ge=0, le=1, description="Share of the work that is done.")

@@ -68,6 +68,8 @@ def page(services: Services, limit: int, cursor: str | None, state: JobState | N
         models = bundles.many(session, [row.model_id or "" for row in shown])
         work = stages.of_trainings(session, [row.id for row in shown])
     items = [TrainingSummary(**summary_fields(row, sets, models, work[row.id].fraction)) for row in shown]
+    for item in items:
+        item.settings = {name: value for name, value in item.settings.items() if name != "classes"}
     return TrainingPage(items=items, next=following)
 
 
@@ -101,8 +103,9 @@ def cancel(services: Services, training_id: str) -> Training:
 
 
 def retry(services: Services, training_id: str) -> Training:
-    """Run a failed or cancelled training again. NotFound, Conflict for another."""
+    """Run a failed or cancelled training again. NotFound, Conflict for another; 429 where too many are under way."""
     with services.catalog.transaction() as tx:
+        check_active_jobs(services, tx.session)
         retry_training(tx, training_id)
         note_result(tx.session, "trainings", training_id)
     return get(services, training_id)

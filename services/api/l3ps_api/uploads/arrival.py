@@ -39,6 +39,7 @@ def join(services: Services, row: UploadRow, completion: Completion) -> ApiProbl
         # An earlier try may have joined the parts and then lost its answer or its catalog.
         if not services.store.exists(row.object_key):
             raise invalid("parts", str(error), "PUT the parts again.", code="invalid-parts") from error
+        services.store.abort_multipart(row.object_key, row.s3_upload_id)  # what such a try may have left of it
         return None
     return refusal
 

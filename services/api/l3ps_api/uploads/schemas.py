@@ -65,6 +65,11 @@ class UploadProgress(Upload):
     part_size: int = Field(description="Bytes of every part but the last.")
     part_count: int = Field(description="How many parts there are.")
     received: list[ReceivedPart] = Field(description="The parts that have arrived whole, of an open upload.")
+    joined: bool = Field(
+        default=False,
+        description="All parts have arrived and been joined, and no more can be sent: complete the upload, without "
+        "naming parts.",
+    )
 
 
 class OpenUpload(Upload):

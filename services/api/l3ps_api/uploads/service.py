@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
 from l3ps_api.annotation_sets.schemas import Annotations
 from l3ps_api.drives.schemas import Drive
-from l3ps_api.limits import over_quota
 from l3ps_api.models.schemas import MODEL_NAME, Model
 from l3ps_api.pages import cut
 from l3ps_api.problems import ApiProblem, conflict, invalid, too_large
 from l3ps_api.services import Services
+from l3ps_api.uploads import quota
 from l3ps_api.uploads.arrival import join
 from l3ps_api.uploads.parts import part_count, part_length, part_size, size_of_parts
 from l3ps_api.uploads.schemas import (
@@ -37,10 +36,9 @@ from l3ps_platform.catalog import (
     annotation_sets,
     bundles,
     drives,
-    quotas,
     uploads,
 )
-from l3ps_platform.errors import Conflict, NotFound, UploadError
+from l3ps_platform.errors import Conflict, UploadError
 from l3ps_platform.ids import new_id
 from l3ps_platform.objects import MAX_SECONDS
 from l3ps_platform.workflow import accept_drive, accept_model
@@ -72,12 +70,13 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
     upload_id, count = new_id("upl"), part_count(request.size, settings)
     key = f"uploads/{upload_id}/archive"  # nothing of the client's: what it calls the file is the row's
     seconds = min(settings.upload_ttl_seconds, MAX_SECONDS)
-    multipart = services.store.create_multipart(key)
+    each = part_size(request.size, settings)
+    with services.catalog.reading() as session:  # before anything is begun in the store
+        quota.check(session, settings, request.size)
+    multipart = services.store.create_multipart(key, each)
     try:
         with services.catalog.transaction() as tx:
-            if quotas.open_uploads(tx.session) >= settings.max_open_uploads:
-                remedy = "Complete some of them, or give them up."
-                raise over_quota("uploads", settings.max_open_uploads, "open uploads", remedy)
+            quota.check(tx.session, settings, request.size)
             row = uploads.add(
                 tx,
                 id=upload_id,
@@ -86,7 +85,7 @@ def open_upload(services: Services, request: UploadRequest) -> OpenUpload:
                 size=request.size,
                 sha256=request.sha256,
                 parts=count,
-                part_size=part_size(request.size, settings),
+                part_size=each,
                 object_key=key,
                 s3_upload_id=multipart,
                 seconds=seconds,
@@ -103,7 +102,7 @@ def opened(services: Services, upload_id: str) -> OpenUpload:
     with services.catalog.reading() as session:
         row = uploads.get(session, upload_id)
     urls = _presigned(services, row, range(1, row.parts + 1))
-    return OpenUpload(**_fields(row), part_size=part_size(row.size, services.settings), parts=urls)
+    return OpenUpload(**_fields(row), part_size=size_of_parts(row, services.settings), parts=urls)
 
 
 def page(services: Services, limit: int, cursor: str | None, state: UploadState | None) -> UploadPage:
@@ -120,15 +119,18 @@ def get(services: Services, upload_id: str) -> UploadProgress:
     with services.catalog.reading() as session:
         row = uploads.get(session, upload_id)
     received: list[ReceivedPart] = []
+    joined = False
     if row.state is UploadState.OPEN:
-        with suppress(UploadError):  # closed in this moment
+        try:
             received = [
                 ReceivedPart(number=part.number, size=part.size, etag=part.etag)
                 for part in services.store.list_parts(row.object_key, row.s3_upload_id)
                 if part.size is not None and part.size == part_length(part.number, row, services.settings)
             ]
+        except UploadError:  # a completion joined the parts and was cut off, or the upload was closed in this moment
+            joined = services.store.exists(row.object_key)
     each = size_of_parts(row, services.settings)
-    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received)
+    return UploadProgress(**_fields(row), part_size=each, part_count=row.parts, received=received, joined=joined)
 
 
 def urls(services: Services, upload_id: str, numbers: Iterable[int]) -> PartUrls:
@@ -232,11 +234,9 @@ def _accept(tx: Transaction, row: UploadRow, name: str, sha256: str | None) -> t
         return accept_drive(tx, name=name, **file).id, True
     if row.kind == "annotations":
         return annotation_sets.add(tx, name=name, **file).id, True
-    try:
-        known = bundles.by_name(tx.session, name)
-    except NotFound:
-        return accept_model(tx, name=name, **file).id, True
-    if sha256 is not None and known.sha256 == sha256 and known.state is not ModelState.REJECTED:
+    known = bundles.named(tx.session, name)
+    if known is not None and sha256 is not None and known.sha256 == sha256 and known.state is not ModelState.REJECTED:
+        # On the client's word: it gets the model that has the checksum it names, which a worker checks or has checked.
         return known.id, False
     return accept_model(tx, name=name, **file).id, True
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
+from fastapi.concurrency import run_in_threadpool
 
 from l3ps_api.services import Cursor, Limit, ServicesDep, id_of
 from l3ps_api.webhooks import service
@@ -26,9 +27,10 @@ router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 
 
 @router.post("", status_code=201)
-def create_webhook(request: WebhookRequest, response: Response, services: ServicesDep) -> NewWebhook:
+async def create_webhook(request: WebhookRequest, response: Response, services: ServicesDep) -> NewWebhook:
     """Have a URL told of events from now on. The answer holds the secret that messages are signed with."""
-    webhook = service.create(services, request)
+    await service.admit(services, request.url)
+    webhook = await run_in_threadpool(service.create, services, request)
     response.headers["Location"] = f"/v1/webhooks/{webhook.id}"
     response.headers["Cache-Control"] = "no-store"
     return webhook
@@ -49,9 +51,11 @@ def get_webhook(webhook_id: str, services: ServicesDep) -> Webhook:
 
 
 @router.patch("/{webhook_id}")
-def change_webhook(webhook_id: str, request: WebhookChange, services: ServicesDep) -> Webhook:
+async def change_webhook(webhook_id: str, request: WebhookChange, services: ServicesDep) -> Webhook:
     """Change a webhook, or switch it off or on."""
-    return service.change(services, webhook_id, request)
+    if request.url is not None:
+        await service.admit(services, request.url)
+    return await run_in_threadpool(service.change, services, webhook_id, request)
 
 
 @router.delete("/{webhook_id}", status_code=204)

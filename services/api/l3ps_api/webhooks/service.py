@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 
 from l3ps_api.pages import cut
@@ -26,11 +28,26 @@ from l3ps_platform.workflow import deliveries
 
 MAX_WEBHOOKS = 50
 """In a project. Whatever happens makes one row each, in the transaction in which it happens."""
+RESOLVE_SECONDS = 5.0
+_RESOLVERS = ThreadPoolExecutor(4, thread_name_prefix="resolver")
+"""Threads of their own: a name server that does not answer keeps one for half a minute, whatever waits for it."""
+
+
+async def admit(services: Services, url: str) -> None:
+    """Raise a 422 problem unless a URL may be called now. Its host is looked up, by somebody else's name servers."""
+    guard = Guard(services.settings.webhook_allow, http=services.settings.webhook_http)
+    looked_up = asyncio.get_running_loop().run_in_executor(_RESOLVERS, guard.admit, url)
+    try:
+        await asyncio.wait_for(looked_up, RESOLVE_SECONDS)
+    except TargetRefused as refusal:
+        raise invalid("url", refusal.what, refusal.remedy, code="url-refused") from refusal
+    except TimeoutError:
+        what = f"its host was not found within {RESOLVE_SECONDS:g} s"
+        raise invalid("url", what, "Try again later, or use another name.", code="url-refused") from None
 
 
 def create(services: Services, request: WebhookRequest) -> NewWebhook:
-    """A new webhook. 422 when its URL may not be called, 409 when there are too many."""
-    _check(services, request.url)
+    """A new webhook, whose URL has been admitted. 409 when there are too many."""
     with services.catalog.transaction() as tx:
         if webhooks.count(tx.session) >= MAX_WEBHOOKS:
             detail = f"The project has {MAX_WEBHOOKS} webhooks, which is as many as there can be."
@@ -70,9 +87,7 @@ def get(services: Services, webhook_id: str) -> Webhook:
 
 
 def change(services: Services, webhook_id: str, request: WebhookChange) -> Webhook:
-    """Change what the request names. NotFound; 422 when the new URL may not be called."""
-    if request.url is not None:
-        _check(services, request.url)
+    """Change what the request names; a new URL has been admitted. NotFound."""
     with services.catalog.transaction() as tx:
         row = webhooks.lock(tx.session, webhook_id)
         for name in ("url", "events", "description"):
@@ -87,8 +102,7 @@ def change(services: Services, webhook_id: str, request: WebhookChange) -> Webho
 
 def delete(services: Services, webhook_id: str) -> None:
     """Forget a webhook and its deliveries. NotFound."""
-    with services.catalog.transaction() as tx:
-        tx.session.delete(webhooks.get(tx.session, webhook_id))
+    deliveries.forget(services.catalog, webhook_id)
 
 
 def rotate(services: Services, webhook_id: str, overlap_seconds: int) -> NewWebhook:
@@ -134,16 +148,7 @@ def replay(services: Services, webhook_id: str, delivery_id: str) -> Delivery:
 
 def replay_failed(services: Services, webhook_id: str, since: datetime) -> Replayed:
     """Make all failed deliveries since a date again. NotFound, Conflict where the webhook is switched off."""
-    with services.catalog.transaction() as tx:
-        hook = webhooks.lock(tx.session, webhook_id)
-        return Replayed(count=deliveries.replay(tx, hook, webhooks.failed_since(tx.session, webhook_id, since)))
-
-
-def _check(services: Services, url: str) -> None:
-    try:
-        Guard(services.settings.webhook_allow, http=services.settings.webhook_http).admit(url)
-    except TargetRefused as refusal:
-        raise invalid("url", refusal.what, refusal.remedy, code="url-refused") from refusal
+    return Replayed(count=deliveries.replay_failed(services.catalog, webhook_id, since))
 
 
 def _with_secret(row: WebhookRow) -> NewWebhook:
