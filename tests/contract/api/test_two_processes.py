@@ -108,9 +108,9 @@ class Place:
     def taken(self, lease: float) -> list[workflow.Claim]:
         """The same, in a worker's hands."""
         claims = []
-        for row in self.job():
+        for number, row in enumerate(self.job()):
             with self.catalog.transaction() as tx:
-                claims.append(workflow.claim(tx, row.id, 1, "host:1:2", lease_seconds=lease, max_attempts=3))
+                claims.append(workflow.claim(tx, row.id, 1, f"host:1:{number}", lease_seconds=lease))
         return claims
 
     def deleted_job(self, name: str) -> None:

@@ -17,7 +17,9 @@ from l3ps_api.labels.published import Published, published
 from l3ps_api.services import Services
 from l3ps_platform.errors import StoreUnavailable
 
-_BLOCK = 1 << 20
+_BLOCK = 1 << 19
+_PIECE = 1 << 18
+"""Each piece costs a visit to a thread: in pieces of a header each, eight archives kept all others waiting."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,21 @@ class LabelArchive:
         self.etag = digest.hexdigest()[:32]
 
     def read(self, begin: int, end: int) -> Iterator[bytes]:
-        """The bytes from ``begin`` up to ``end``.
+        """The bytes from ``begin`` up to ``end``, in pieces worth handing on: headers and small files together.
 
         Raises:
             StoreError: the store is away, or a file is gone or not what the manifest says.
         """
+        piece = bytearray()
+        for block in self._blocks(begin, end):
+            piece += block
+            if len(piece) >= _PIECE:
+                yield bytes(piece)
+                piece.clear()
+        if piece:
+            yield bytes(piece)
+
+    def _blocks(self, begin: int, end: int) -> Iterator[bytes]:
         at = 0
         for folder in self._folders:
             if at < end and begin < at + folder.size:
