@@ -47,7 +47,6 @@ def test_training_killed(scenario, ends_well, undisturbed: str) -> None:
     annotations = service.upload(service.workload.annotations, "four.zip", "annotations")
     training = service.post("/v1/models/train", name="trained", annotations=annotations, **SETTINGS)["id"]
     trainer = service.start_worker("trainer", queues="train")
-    service.start_worker(concurrency=2)
 
     def trains(attempt: int) -> StageRow:
         begun = (StageRow.attempt == attempt, StageRow.state == StageState.RUNNING)
@@ -56,6 +55,7 @@ def test_training_killed(scenario, ends_well, undisturbed: str) -> None:
 
     watcher = service.child_of(trains(1))
     service.note_in_flight()
+    service.start_worker(concurrency=2)
     os.kill(descendants(watcher)[0], signal.SIGKILL)
     os.kill(service.child_of(trains(2)), signal.SIGKILL)
     trains(3)
