@@ -241,7 +241,7 @@ def test_a_trainer_that_does_not_listen_is_killed_with_all_it_forked(direct, des
     during(monkeypatch, lambda: desk.cancel(id))
     assert direct.step() == "cancelled"
     forked = int(re.search(r"forked (\d+)", desk.log(id))[1])
-    direct.until(lambda: not alive(forked), 10)
+    direct.until(lambda: not alive(forked), seconds=10)
 
 
 def test_a_stopping_worker_gives_the_training_back_with_its_checkpoint(direct, desk: Desk, monkeypatch) -> None:
