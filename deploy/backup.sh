@@ -7,6 +7,8 @@ set -eu
 . "$(dirname "$0")/copies.sh"
 mkdir -p "$dir"
 docker compose exec -T postgres pg_dump --username l3ps --format custom l3ps > "$dir/catalog.dump.new"
+# Nothing goes from the copy before its catalog is the new one: cut short, it still has all that the old one names.
+rclone copy --update --use-server-modtime "l3ps:l3ps" "$dir/objects"
+mv "$dir/catalog.dump.new" "$dir/catalog.dump"
 rclone sync --update --use-server-modtime "l3ps:l3ps" "$dir/objects"
-mv "$dir/catalog.dump.new" "$dir/catalog.dump" # last: a copy cut short leaves the catalog of the one before
 echo "Copied the catalog and $(find "$dir/objects" -type f | wc -l) objects into $dir."
