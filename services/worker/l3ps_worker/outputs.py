@@ -41,8 +41,9 @@ def pin(context: Context, claim: workflow.Claim, prefix: str, progress: Progress
 
     Raises:
         OutputDoomed: it is still being deleted; a later attempt makes it anew.
+        CatalogUnavailable: for as long as a stage waits for one.
         LeaseLost: the stage is no longer ours.
-        CatalogUnavailable: for as long as a stage waits for one, or the worker is to stop.
+        Cancelled, Stopping: of ``progress``, when the stage is to end while it waits.
     """
     begun = time.monotonic()
     while True:

@@ -120,10 +120,12 @@ class Scratch:
         while True:
             with lock_path.open("a+b") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
+                mine = False
                 with suppress(FileNotFoundError):
-                    if lock_path.stat().st_ino == os.fstat(lock.fileno()).st_ino:
-                        yield
-                        return
+                    mine = lock_path.stat().st_ino == os.fstat(lock.fileno()).st_ino
+                if mine:
+                    yield
+                    return
 
     def _make(self, key: str, make: Callable[[Path], object]) -> None:
         """Make an entry; on a full disk once more with every entry deleted that nobody uses."""

@@ -17,10 +17,12 @@ from l3ps_platform.catalog.models import (
     UploadRow,
 )
 from l3ps_platform.catalog.output_rows import OutputRow
-from l3ps_platform.catalog.states import UploadState
+from l3ps_platform.catalog.states import StageName, UploadState
 
 TOPS = ("jobs/", "stages/", "trainings/", "uploads/")
 """Where the product keeps objects that rows refer to."""
+HOLD_ARCHIVES = ("trainings/", "uploads/")
+"""Those of them where an object may be one's archive: a training's bundle under another name lies beside its log."""
 _ARCHIVES = (DriveRow, ModelRow, AnnotationsRow)
 
 
@@ -36,7 +38,7 @@ def owned(session: Session, group: str, keys: Collection[str]) -> bool:
     Args:
         session: the session.
         group: their common prefix.
-        keys: of the objects, where they are an upload's.
+        keys: of the objects, where one may be an archive.
     """
     top, id = group.split("/")[:2]
     if top == "stages":
@@ -46,10 +48,12 @@ def owned(session: Session, group: str, keys: Collection[str]) -> bool:
         return job is not None and job.swept_at is None
     if top == "trainings":
         training = session.get(TrainingRow, id)
-        return training is not None and (training.log_key is not None or not training.state.final)
-    upload = session.get(UploadRow, id)
-    if upload is not None and upload.state is UploadState.OPEN:
-        return True
+        if training is not None and (training.log_key is not None or not training.state.final):
+            return True
+    else:
+        upload = session.get(UploadRow, id)
+        if upload is not None and upload.state is UploadState.OPEN:
+            return True
     queries = (select(kind.id).where(kind.object_key.in_(keys)) for kind in _ARCHIVES)
     return any(session.scalar(query.limit(1)) is not None for query in queries)
 
@@ -59,6 +63,12 @@ def project_of_group(session: Session, group: str) -> str | None:
     parts = group.split("/")
     project = session.get(ProjectRow, parts[1]) if len(parts) == 3 else None
     return project.id if project is not None else None
+
+
+def stage_of_group(group: str) -> StageName | None:
+    """The stage in the name of a group of outputs; None where it says none: no stage put it there, or will take it."""
+    name = group.rpartition("/")[2].partition("-")[0]
+    return next((stage for stage in StageName if stage == name), None)
 
 
 def open_upload(session: Session, key: str, s3_upload_id: str) -> bool:

@@ -28,7 +28,10 @@ def arrivals(session: Session, before: datetime, limit: int) -> int:
 
 
 def training_logs(session: Session, before: datetime, limit: int) -> int:
-    """Give up the logs of trainings that ended before then; how many. Their objects belong to nobody then."""
+    """Give up the logs of trainings that ended before then; how many.
+
+    Their objects belong to nobody then, but for those that lie beside a model's bundle.
+    """
     old = select(TrainingRow.id).where(
         TrainingRow.log_key.is_not(None), TrainingRow.finished_at < before, TrainingRow.state.not_in(ACTIVE)
     )

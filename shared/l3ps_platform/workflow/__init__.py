@@ -1,6 +1,7 @@
 """The state machine of drives, models, jobs, scenes, trainings and stages.
 
-Functions take a transaction and change rows.
+Functions take a transaction and change rows; release_owned and settle_arrivals take a catalog, and make one for each
+row.
 
 accept_drive, accept_model     an upload is complete → ingest
 accept_source, settle_arrivals a log lies, or has arrived, in somebody else's bucket → ingest, job

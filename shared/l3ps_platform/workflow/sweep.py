@@ -60,7 +60,8 @@ Row = TypeVar("Row", AnnotationsRow, DriveRow, JobRow, ModelRow, OutputRow, Trai
 
 @dataclass(slots=True)
 class Group:
-    """Objects of one owner: their common prefix, when the newest was written, and the keys of an upload's, a few."""
+    """Objects of one owner: their common prefix, when the newest was written, and, where one may be an archive, their
+    keys, a few."""
 
     name: str
     newest: datetime
@@ -239,12 +240,12 @@ class Sweeper:
     def _groups(self) -> Iterator[Group]:
         """The objects of each owner."""
         for top in belongings.TOPS:
-            found = (info for info in self._store.list(top) if info.key.count("/") > 1)
+            found = (info for info in self._store.list(top) if info.key != belongings.group_of(info.key))
             for name, infos in groupby(found, key=lambda info: belongings.group_of(info.key)):
                 group = Group(name, datetime.min.replace(tzinfo=UTC), [])
                 for info in infos:
                     group.newest = max(group.newest, info.modified)
-                    if top == "uploads/":
+                    if top in belongings.HOLD_ARCHIVES:
                         group.keys.append(info.key)
                 yield group
 
@@ -254,15 +255,14 @@ class Sweeper:
             before = self._catalog.now(session) - timedelta(seconds=self._settings.orphan_seconds)
             if found.newest >= before or belongings.owned(session, group, found.keys):
                 return False
-            project = belongings.project_of_group(session, group)
+            project, stage = belongings.project_of_group(session, group), belongings.stage_of_group(group)
         log.info("orphans found", group=group)
-        if project is None:
+        if project is None or stage is None:
             self._store.delete_prefix(f"{group}/")
             return True
         # A stage may be about to pin it: so it goes the way of all outputs, which takes its row.
         with self._catalog.transaction() as tx:
             if outputs.lock(tx.session, group) is None:
-                stage = StageName(group.split("/")[2].partition("-")[0])
                 outputs.hold(tx, group, stage, project).state = OutputState.DOOMED
         return True
 

@@ -240,6 +240,17 @@ def test_what_nobody_owns_goes_after_a_day_and_what_somebody_owns_stays(house) -
     assert lost not in {pending.upload_id for pending in house.store.list_multipart()}
 
 
+def test_what_lies_among_the_outputs_and_is_none_goes_too(house) -> None:
+    job = house.job()
+    for key in (f"stages/{PROJECT}/notes/x", "stages/old-notes/x"):
+        house.store.put_bytes(key, b"x")
+    house.store.put_bytes(f"stages/{PROJECT}/file", b"in no folder: not of the sweep")
+    sweeper = workflow.Sweeper(house.catalog, house.store, Settings(orphan_seconds=-1))
+    assert sweeper.run_once()["orphans"] == 2
+    assert sweeper.chore.failures["orphans"] == 0
+    assert house.groups() == stage_keys("a") | {f"jobs/{job}", f"stages/{PROJECT}"}
+
+
 def test_retention_by_age_takes_the_old_and_nothing_that_is_in_use(house) -> None:
     old, new = house.job("old"), house.job("new")
     with house.catalog.transaction() as tx:
@@ -352,12 +363,42 @@ def test_what_is_over_for_a_quarter_of_a_year_is_forgotten_and_what_is_not_over_
     assert not {complete, aborted, settled} & left
 
 
+def annotations(tx) -> None:
+    tx.session.add(AnnotationsRow(id="ann_1", name="a", filename="a.zip", size=1, created_at=tx.now))
+    tx.session.flush()
+
+
+def test_a_bundle_beside_a_training_s_log_is_its_model_s(house) -> None:
+    """Where the same training under another name was made anew, or its log is of long ago: with a log and without."""
+    kept = {}
+    with house.catalog.transaction() as tx:
+        annotations(tx)
+    for name, log in (("cached", None), ("logged", "trainings/trn_logged/log.txt")):
+        model, key = house.play.model(), f"trainings/trn_{name}/bundle.zip"
+        kept[model] = key
+        for written in filter(None, (key, log)):
+            house.store.put_bytes(written, b"x")
+        values = {"id": f"trn_{name}", "name": name, "annotations_id": "ann_1", "settings": {}, "log_key": log}
+        with house.catalog.transaction() as tx:
+            bundles.lock(tx.session, model).object_key = key
+            times = {"created_at": tx.now, "finished_at": tx.now - timedelta(days=91)}
+            tx.session.add(TrainingRow(state=JobState.SUCCEEDED, model_id=model, **values, **times))
+    sweeper = workflow.Sweeper(house.catalog, house.store, Settings(orphan_seconds=-1, orphans_every_seconds=0))
+    for _ in range(2):
+        sweeper.run_once()
+    assert {*kept.values()} <= {info.key for info in house.store.list()}
+    with house.catalog.transaction() as tx:
+        for model in kept:
+            bundles.delete(tx, model)
+    for _ in range(2):
+        sweeper.run_once()
+    assert list(house.store.list()) == []
+
+
 def test_the_log_of_a_training_of_long_ago_goes(house) -> None:
     trainings_ = {}
     with house.catalog.transaction() as tx:
-        row = AnnotationsRow(id="ann_1", name="a", filename="a.zip", size=1, created_at=tx.now)
-        tx.session.add(row)
-        tx.session.flush()
+        annotations(tx)
         for name, state, since in (
             ("old", JobState.SUCCEEDED, 91),
             ("new", JobState.SUCCEEDED, 89),

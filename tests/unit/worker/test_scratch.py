@@ -99,11 +99,12 @@ def test_what_is_in_use_stays(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_a_work_folder_is_gone_after_use(tmp_path: Path) -> None:
+@pytest.mark.parametrize("reason", [RuntimeError, FileNotFoundError])
+def test_a_work_folder_is_gone_after_use(tmp_path: Path, reason: type[Exception]) -> None:
     scratch = Scratch(tmp_path, 0)
-    with pytest.raises(RuntimeError), scratch.workdir() as folder:
+    with pytest.raises(reason, match="why it failed"), scratch.workdir() as folder:
         (folder / "x").write_bytes(b"x")
-        raise RuntimeError
+        raise reason("why it failed")
     assert list((tmp_path / "work").iterdir()) == []
     assert list((tmp_path / "locks").iterdir()) == []
 
