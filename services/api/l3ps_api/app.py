@@ -35,6 +35,7 @@ from l3ps_api.operations import operations_of
 from l3ps_api.patience import HangUp
 from l3ps_api.places import Places, Turns
 from l3ps_api.projects.routes import router as projects
+from l3ps_api.replies import asked_within
 from l3ps_api.retention.routes import router as retention
 from l3ps_api.rules.routes import router as rules
 from l3ps_api.services import Services
@@ -96,6 +97,7 @@ def create_app(settings: Settings) -> FastAPI:
         title="l3ps", version=version("l3ps-api"), description=DESCRIPTION.strip(), lifespan=_lifespan, redoc_url=None
     )
     app.state.services = services
+    app.state.beside = Catalog(settings.catalog_url)
     app.state.keyring = Keyring(settings, catalog)
     app.state.events = EventHub(catalog, settings.event_streams)
     app.state.archives = Places(ARCHIVES, "too-many-archives", "archives", "Wait until one has been downloaded.")
@@ -127,7 +129,7 @@ def create_app(settings: Settings) -> FastAPI:
             "webhooks": webhook_service.shown_again,
         },
     )  # fmt: skip
-    app.add_middleware(ETags)
+    app.add_middleware(ETags, operations=lambda: operations_of(app))
     app.add_middleware(Gate, settings=settings, keyring=app.state.keyring, operations=lambda: operations_of(app))
     app.add_middleware(SizeLimits, exempt="/v1/objects/")
     app.add_middleware(errors.Problems)
@@ -143,6 +145,9 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 async def _turn(request: Request, principal: PrincipalDep) -> AsyncIterator[None]:
+    if asked_within(request.scope):  # its turn is that of the one who asks
+        yield
+        return
     turns: Turns = request.app.state.turns
     async with turns.turn(principal.project_id):
         yield  # until there is an answer; sending it takes as long as the client does
@@ -172,4 +177,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for thread in threads:
             await run_in_threadpool(thread.join, 10)
         services.catalog.dispose()
+        app.state.beside.dispose()
         services.queue.close()

@@ -21,6 +21,7 @@ class Operation:
         status: of its success.
         query: names of its query parameters.
         repeated: those of them that may be given several times.
+        document: whether its answer is JSON.
         resource: whether its answer is a document with an id.
     """
 
@@ -28,6 +29,7 @@ class Operation:
     status: int
     query: frozenset[str] = frozenset()
     repeated: frozenset[str] = frozenset()
+    document: bool = False
     resource: bool = False
 
 
@@ -79,12 +81,14 @@ def _api_routes(routes: Iterable[BaseRoute]) -> Iterator[APIRoute]:
 def _operation(route: APIRoute, described: dict[str, Any], schemas: dict[str, Any]) -> Operation:
     query = [parameter for parameter in described.get("parameters", ()) if parameter.get("in") == "query"]
     status = route.status_code or 200
-    answer = described.get("responses", {}).get(str(status), {}).get("content", {}).get("application/json", {})
+    content = described.get("responses", {}).get(str(status), {}).get("content", {})
+    answer = content.get("application/json", {})
     return Operation(
         route.path_format,
         status,
         frozenset(parameter["name"] for parameter in query),
         frozenset(parameter["name"] for parameter in query if "array" in str(parameter["schema"])),
+        "application/json" in content,
         _has_id(answer.get("schema", {}), schemas),
     )
 

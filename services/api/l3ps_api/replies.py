@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 Headers = list[tuple[bytes, bytes]]
 
 _OF_THE_REQUEST = (b"content-length", b"content-type", b"idempotency-key", b"if-match", b"if-none-match", b"range")
+_WITHIN = "asked_within"
 
 
 @dataclass(slots=True)
@@ -82,18 +84,31 @@ async def hold(
     return reply
 
 
-async def ask(app: ASGIApp, scope: Scope, path: str) -> Reply:
-    """The answer that the caller of a request would get to GET ``path``."""
+async def ask(app: ASGIApp, scope: Scope, path: str, *, within: bool = False) -> Reply:
+    """The answer that the caller of a request would get to GET ``path``.
+
+    ``within``: asked by one that holds a turn and a transaction, and waits for the answer (:func:`asked_within`).
+    """
     headers = [(name, value) for name, value in scope["headers"] if name not in _OF_THE_REQUEST]
     question: dict[str, Any] = {
         **scope, "method": "GET", "path": path, "raw_path": path.encode(), "query_string": b"", "headers": headers,
-        "state": dict(scope["state"]),
+        "state": {**scope["state"], _WITHIN: within},
     }  # fmt: skip
+    given = False
 
     async def nothing() -> Message:
+        nonlocal given
+        if given:
+            await asyncio.Event().wait()  # whoever listens for the end of the client: it waits for the answer
+        given = True
         return {"type": "http.request", "body": b"", "more_body": False}
 
     async def nowhere(_: Message) -> None:
         return None
 
     return await hold(app, question, nothing, nowhere) or Reply()
+
+
+def asked_within(scope: Scope) -> bool:
+    """Whether a transaction waits for the answer: to take what those have who wait for that transaction has no end."""
+    return bool(scope.get("state", {}).get(_WITHIN))

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from l3ps_api.auth import PrincipalDep
 from l3ps_api.jobs.documents import Documents
 from l3ps_api.labels.manifests import Manifests
+from l3ps_api.replies import asked_within
 from l3ps_platform.catalog import DEFAULT_PROJECT
 from l3ps_platform.catalog.session import Catalog
 from l3ps_platform.ids import Prefix, is_id
@@ -42,8 +43,10 @@ SystemDep = Annotated[Services, Depends(_system)]
 """For what belongs to no project: health, metrics, presigned objects."""
 
 
-async def _own(system: SystemDep, principal: PrincipalDep) -> Services:
-    return replace(system, catalog=system.catalog.scoped(principal.project_id))
+async def _own(request: Request, system: SystemDep, principal: PrincipalDep) -> Services:
+    # Those who wait for the transaction that asks may have all connections of the other.
+    catalog: Catalog = request.app.state.beside if asked_within(request.scope) else system.catalog
+    return replace(system, catalog=catalog.scoped(principal.project_id))
 
 
 ServicesDep = Annotated[Services, Depends(_own)]

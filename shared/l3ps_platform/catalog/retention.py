@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from sqlalchemy import ColumnElement, exists, func, or_, select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from l3ps_platform.catalog.models import DriveRow, JobRow, ProjectRow
@@ -21,10 +22,13 @@ def get(session: Session) -> RetentionRow | None:
 def put(tx: Transaction, *, max_age_days: int | None, max_bytes: int | None) -> RetentionRow:
     """Set the limits of the transaction's project."""
     project_id = project_of(tx.session)
-    row = RetentionRow(id=project_id, project_id=project_id, max_age_days=max_age_days, max_bytes=max_bytes)
-    row = tx.session.merge(row)
-    tx.session.flush()
-    return row
+    limits = {"max_age_days": max_age_days, "max_bytes": max_bytes}
+    insert = postgresql.insert if tx.session.get_bind().dialect.name == "postgresql" else sqlite.insert
+    statement = insert(RetentionRow).values(id=project_id, project_id=project_id, **limits)
+    # One statement: of two that found no row, the second to add one would fail.
+    tx.session.execute(statement.on_conflict_do_update(index_elements=["id"], set_=limits))
+    found = select(RetentionRow).where(RetentionRow.id == project_id).execution_options(populate_existing=True)
+    return tx.session.scalars(found).one()
 
 
 def limited(session: Session) -> list[RetentionRow]:

@@ -206,6 +206,7 @@ def replica(service) -> Iterator[TestClient]:
     credentials = {"Authorization": f"Bearer {service.token}"}
     yield TestClient(api, base_url="http://127.0.0.1", headers=credentials)
     api.state.services.catalog.dispose()
+    api.state.beside.dispose()
     api.state.services.queue.close()
 
 

@@ -83,6 +83,25 @@ def test_what_does_not_exist_is_said_before_any_etag(service):
     service.refused(service.http.delete("/v1/drives/none", headers={"If-Match": '"x"'}), 404, "unknown-drive")
 
 
+@pytest.mark.parametrize("path", ["/v1/events", "/v1/jobs/none/events", "/v1/labels.tar"])
+def test_what_has_no_end_or_is_no_document_is_not_looked_at(service, path):
+    service.refused(service.http.delete(path, headers={"If-Match": '"x"'}), 405, "method-not-allowed")
+    assert service.http.get("/v1/me").is_success
+
+
+def test_changes_with_a_condition_pass_among_as_many_others_as_come(service):
+    """These wait for the lock or row of a change, and it asks once more what it changes before it ends."""
+
+    def put(number: int) -> int:
+        headers = {"If-Match": "*"} if number % 3 == 0 else {}
+        limits = {"max_age_days": 36_000 + number if number else None, "max_bytes": None}
+        return service.http.put("/v1/retention", json=limits, headers=headers).status_code
+
+    with ThreadPoolExecutor(40) as pool:
+        assert set(pool.map(put, range(1, 120))) == {200}
+    assert put(0) == 200
+
+
 def test_a_change_whose_body_dribbles_holds_nobody_up(service, webhook):
     begun, enough = threading.Event(), threading.Event()
 

@@ -16,6 +16,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 import structlog
+from anyio import CapacityLimiter
 from fastapi.concurrency import run_in_threadpool
 
 from l3ps_api.places import Places
@@ -27,6 +28,8 @@ log = structlog.get_logger(__name__)
 TICK_SECONDS = 0.5
 RING = 2000
 PAGE = 500
+_READERS = 4
+"""Streams that read the log at once, in threads of their own: while the catalog does not answer, they hold no more."""
 _REMEDY = "Close some, follow the project by one stream, or ask for the jobs' states instead."
 
 
@@ -61,11 +64,13 @@ class EventHub:
         head: events up to this number are in the log or the ring; -1 while nothing is known yet.
         listeners: how many streams there are.
         closing: the process stops and so shall the streams.
+        readers: who may read the log at once.
         places: those of the streams.
     """
 
     def __init__(self, catalog: Catalog, limit: int = 500) -> None:
         self._catalog = catalog
+        self.readers = CapacityLimiter(_READERS)
         self.places = Places(limit, "too-many-streams", "streams", _REMEDY)
         self._ring: deque[Entry] = deque()
         self._watched: Counter[str] = Counter()

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import structlog
-from fastapi.concurrency import run_in_threadpool
+from anyio import to_thread
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
 from l3ps_api.events.hub import PAGE, Entry, EventHub
@@ -106,7 +106,7 @@ async def _after(hub: EventHub, feed: Feed, cursor: int) -> tuple[list[Entry], i
     if cursor >= hub.base:
         return [entry for entry in hub.since(cursor) if feed.wants(entry)], max(cursor, hub.head), False
     head = hub.head  # before the look: what comes after it is in the ring
-    found = await run_in_threadpool(feed.read, cursor)
+    found = await to_thread.run_sync(feed.read, cursor, limiter=hub.readers)
     if len(found) == PAGE:
         return found, found[-1].seq, True
     return found, max(cursor, head, found[-1].seq if found else 0), False
