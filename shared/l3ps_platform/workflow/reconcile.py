@@ -176,7 +176,8 @@ class Reconciler:
         return len(spent)
 
     def _settle_arrivals(self) -> int:
-        return settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs)
+        seconds, most = self._settings.reconcile_seconds, self._settings.max_active_jobs
+        return settle_arrivals(self._catalog, seconds, most, self.chore)
 
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:
