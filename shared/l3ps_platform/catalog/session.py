@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import sqlite3
+import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -87,6 +88,7 @@ class Catalog:
         self.url = url
         self._sender = sender
         self._project: str | None = None
+        self._heard: Callable[[float], None] | None = None
         self.engine = make_engine(url)
 
     def scoped(self, project_id: str) -> Catalog:
@@ -100,6 +102,12 @@ class Catalog:
         whole = copy(self)
         whole._project = None
         return whole
+
+    def heard(self, listener: Callable[[float], None]) -> Catalog:
+        """This catalog, which tells someone how many seconds each of its transactions took, whatever its end."""
+        heard = copy(self)
+        heard._heard = listener
+        return heard
 
     @contextmanager
     def alone(self, what: str) -> Iterator[bool]:
@@ -125,15 +133,8 @@ class Catalog:
 
     @contextmanager
     def _connected(self) -> Iterator[Connection]:
-        try:
-            with self.engine.connect() as connection:
-                yield connection.execution_options(isolation_level="AUTOCOMMIT")
-        except (OperationalError, InterfaceError) as error:
-            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
-                raise
-            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
-        except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
-            raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
+        with _unavailable(), self.engine.connect() as connection:
+            yield connection.execution_options(isolation_level="AUTOCOMMIT")
 
     @contextmanager
     def transaction(self) -> Iterator[Transaction]:
@@ -166,17 +167,14 @@ class Catalog:
 
     @contextmanager
     def _session(self, *, write: bool) -> Iterator[Session]:
-        try:
-            # Inside, because a session whose server has gone fails at its close as well.
-            with _CatalogSession(self.engine, expire_on_commit=False, info={"project": self._project}) as session:
-                session.connection(execution_options={"l3ps_write": write})
-                yield session
-        except (OperationalError, InterfaceError) as error:
-            if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
-                raise
-            raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
-        except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
-            raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
+        begun = time.monotonic()
+        # Around the session, because one whose server has gone fails at its close as well, and may be long about it.
+        made = _CatalogSession(self.engine, expire_on_commit=False, info={"project": self._project})
+        with _unavailable(), ExitStack() as closed, made as session:
+            session.connection(execution_options={"l3ps_write": write})
+            if self._heard is not None:  # not before: a wait for a free connection says nothing about the database
+                closed.callback(lambda listener: listener(time.monotonic() - begun), self._heard)
+            yield session
 
     def now(self, session: Session) -> datetime:
         """The database server's time."""
@@ -192,6 +190,19 @@ class Catalog:
             self._sender(messages)
         except Exception:
             log.warning("messages not sent, the reconciler will", stages=[m.stage_id for m in messages], exc_info=True)
+
+
+@contextmanager
+def _unavailable() -> Iterator[None]:
+    """Tell of a database that does not answer as CatalogUnavailable."""
+    try:
+        yield
+    except (OperationalError, InterfaceError) as error:
+        if str(getattr(error.orig, "sqlstate", "")).startswith(_TOO_MUCH):
+            raise
+        raise CatalogUnavailable(f"the catalog does not answer: {error.orig}") from error
+    except NoneFree as error:  # all are in use, most likely by those who wait for a database that does not answer
+        raise CatalogUnavailable("the catalog does not answer: no connection became free") from error
 
 
 class _CatalogSession(Session):

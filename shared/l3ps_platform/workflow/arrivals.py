@@ -10,13 +10,14 @@ from l3ps.errors import InputError
 from l3ps_platform.catalog import quotas, rules
 from l3ps_platform.catalog.session import Catalog, Transaction
 from l3ps_platform.catalog.source_rows import ArrivalRow
-from l3ps_platform.errors import CatalogUnavailable, NotFound
+from l3ps_platform.errors import NotFound
+from l3ps_platform.workflow.chores import Chore
 from l3ps_platform.workflow.planning import accept_source, error_json, submit_job
 
 log = structlog.get_logger(__name__)
 
 
-def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
+def settle_arrivals(catalog: Catalog, seconds: float, max_active: int, chore: Chore) -> int:
     """Make jobs of arrivals that wait for it, the oldest first; how many were settled.
 
     Each in a transaction of its own: whatever happens in between, an arrival is one job or none yet. Several may do
@@ -26,6 +27,7 @@ def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
         catalog: of one project, or of all.
         seconds: after which the rest is left to the next call.
         max_active: jobs and trainings that a project may have under way.
+        chore: bears and counts what goes wrong about one: it waits on, and those behind it do not wait for it.
     """
     end, count, last = time.monotonic() + seconds, 0, ""
     full: set[str] = set()
@@ -43,12 +45,8 @@ def settle_arrivals(catalog: Catalog, seconds: float, max_active: int) -> int:
                 if quotas.active_jobs(session) >= max_active:
                     full.add(arrival.project_id)
                     continue
-            try:
+            with chore.row("arrivals", arrival.id):
                 count += _settle(own, arrival)
-            except CatalogUnavailable:
-                raise
-            except Exception:  # it waits on, and those behind it do not wait for it
-                log.exception("arrival not settled", rule=arrival.rule_id, source=arrival.source)
         if not found:
             return count
 

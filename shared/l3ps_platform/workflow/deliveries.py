@@ -206,9 +206,11 @@ def attempted(tx: Transaction, parcel: Parcel, attempt: Attempt, *, disable_afte
 
 def put_back(tx: Transaction, parcels: Sequence[Parcel]) -> None:
     """Let others make deliveries that were claimed and not attempted."""
-    for parcel in sorted(parcels, key=lambda parcel: parcel.webhook_id):
-        mine = (DeliveryRow.id == parcel.id, DeliveryRow.lease_owner == parcel.owner)
-        tx.session.execute(update(DeliveryRow).where(*mine).values(lease_owner=None, lease_until=None))
+    for parcel in sorted(parcels, key=lambda parcel: (parcel.webhook_id, parcel.id)):
+        with suppress(NotFound):  # deleted meanwhile
+            webhooks.lock(tx.session, parcel.webhook_id)
+            mine = (DeliveryRow.id == parcel.id, DeliveryRow.lease_owner == parcel.owner)
+            tx.session.execute(update(DeliveryRow).where(*mine).values(lease_owner=None, lease_until=None))
 
 
 def disable(tx: Transaction, hook: WebhookRow, reason: str) -> None:

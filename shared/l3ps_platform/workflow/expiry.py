@@ -34,30 +34,40 @@ def expire(catalog: Catalog, limit: int, chore: Chore) -> int:
     for rule in rules:
         for act in (_by_age, _by_size):
             with chore.row("expired_jobs", rule.project_id):
-                count += act(catalog, rule, limit - count)
+                count += act(catalog, rule, limit - count, chore)
     return count
 
 
-def _by_age(catalog: Catalog, rule: RetentionRow, limit: int) -> int:
+def _by_age(catalog: Catalog, rule: RetentionRow, limit: int, chore: Chore) -> int:
     if rule.max_age_days is None or limit <= 0:
         return 0
     with catalog.reading() as session:
         before = catalog.now(session) - timedelta(days=rule.max_age_days)
         old = [row for _, row in retention.oldest(session, rule.project_id, before=before, limit=limit)]
-    return sum(_delete(catalog, row, "age") for row in old)
+    count = 0
+    for row in old:
+        with chore.row("expired_jobs", row.id):
+            count += _delete(catalog, row, "age")
+    return count
 
 
-def _by_size(catalog: Catalog, rule: RetentionRow, limit: int) -> int:
+def _by_size(catalog: Catalog, rule: RetentionRow, limit: int, chore: Chore) -> int:
     """One at a time, and then another look: what several jobs share is only free when the last of them is gone."""
     count = 0
-    while rule.max_bytes is not None and count < limit:
+    passed: set[str] = set()
+    while rule.max_bytes is not None and count + len(passed) < limit:
         with catalog.reading() as session:
             if outputs.stored_bytes(session, rule.project_id) <= rule.max_bytes:
                 break
-            found = retention.oldest(session, rule.project_id, limit=1)
-        if not found or not _delete(catalog, found[0][1], "size"):
+            found = retention.oldest(session, rule.project_id, limit=len(passed) + 1)
+        row = next((row for _, row in found if row.id not in passed), None)
+        if row is None:
             break
-        count += 1
+        passed.add(row.id)
+        with chore.row("expired_jobs", row.id):
+            if _delete(catalog, row, "size"):
+                passed.remove(row.id)
+                count += 1
     return count
 
 

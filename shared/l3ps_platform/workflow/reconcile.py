@@ -61,10 +61,10 @@ class Reconciler:
     """
 
     def __init__(self, catalog: Catalog, queue: Queue, settings: Settings) -> None:
-        self._catalog = catalog
+        self._catalog = catalog.heard(self._bear_slowness)
         self._queue = queue
         self._settings = settings
-        self._resender = Resender(catalog, queue, settings)
+        self._resender = Resender(self._catalog, queue, settings)
         self._retry = Retry.of(settings)
         self._leases_count_from = float("-inf")
         self._steps: dict[str, Callable[[], int]] = {
@@ -93,7 +93,7 @@ class Reconciler:
                 try:
                     done[name] = work()
                 except CatalogUnavailable:
-                    self._bear_old_leases()
+                    self._bear_outage()
                     raise
         return Report(**done)
 
@@ -104,13 +104,28 @@ class Reconciler:
         """
         self._leases_count_from = time.monotonic() + self._settings.lease_seconds
 
+    def _bear_outage(self) -> None:
+        """Bear them where the catalog is away, and not where it ended one transaction, as it does in a deadlock."""
+        try:
+            self._catalog.ping()
+        except CatalogUnavailable:
+            self._bear_old_leases()
+
+    def _bear_slowness(self, seconds: float) -> None:
+        """Bear them after a transaction so long that the catalog may have been silent, to workers as well."""
+        if seconds > self._settings.lease_seconds / 3:
+            self._bear_old_leases()
+
     def _expire_leases(self) -> int:
+        # One time for all, and a look at how long its answer took: a transaction that waits for a silent catalog reads
+        # a clock that has gone on meanwhile, and would end leases that nobody could prolong.
+        now = self._now()
         if time.monotonic() < self._leases_count_from:
             return 0
         count = 0
-        for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < self._now()):
+        for stage_id in self._ids(StageRow.state == StageState.RUNNING, StageRow.lease_until < now):
             with self.chore.row("expired", stage_id), self._catalog.transaction() as tx:
-                count += lease_lost(tx, stage_id, self._retry, expired_before=tx.now)
+                count += lease_lost(tx, stage_id, self._retry, expired_before=now)
         return count
 
     def _end_hanging(self) -> int:
@@ -161,7 +176,8 @@ class Reconciler:
         return len(spent)
 
     def _settle_arrivals(self) -> int:
-        return settle_arrivals(self._catalog, self._settings.reconcile_seconds, self._settings.max_active_jobs)
+        seconds, most = self._settings.reconcile_seconds, self._settings.max_active_jobs
+        return settle_arrivals(self._catalog, seconds, most, self.chore)
 
     def _ids(self, *conditions: object) -> list[str]:
         with self._catalog.reading() as session:

@@ -1,11 +1,14 @@
 """What the service cannot do about one thing keeps it from nothing else; on both catalogs."""
 
+import pytest
+
 from l3ps_platform import workflow
-from l3ps_platform.catalog import drives, rules
+from l3ps_platform.catalog import JobRow, drives, retention, rules
 from l3ps_platform.chore_metrics import ChoreCollector
 from l3ps_platform.errors import QueueUnavailable, StoreUnavailable
 from l3ps_platform.settings import Settings
-from l3ps_platform.workflow import Reconciler, Sweeper, arrivals, reconcile, settle_arrivals, sweep
+from l3ps_platform.workflow import Reconciler, Sweeper, arrivals, expiry, reconcile, settle_arrivals, sweep
+from l3ps_platform.workflow.chores import Chore
 
 
 def test_a_lost_worker_s_stage_goes_on_though_another_one_s_cannot(tidy, play, catalog, monkeypatch) -> None:
@@ -94,11 +97,33 @@ def test_an_arrival_that_cannot_be_settled_keeps_those_behind_it_from_nothing(ca
         return accept(tx, source=source)
 
     monkeypatch.setattr(arrivals, "accept_source", refuse)
-    assert settle_arrivals(catalog, 60, 100) == 2
+    chore = Chore("test", "arrivals")
+    assert (settle_arrivals(catalog, 60, 100, chore), chore.failures["arrivals"]) == (2, 1)
     with catalog.reading() as session:
         assert [row.key for row in rules.waiting(session)] == ["log-0"]
     monkeypatch.setattr(arrivals, "accept_source", accept)
-    assert settle_arrivals(catalog, 60, 100) == 1
+    assert (settle_arrivals(catalog, 60, 100, chore), chore.failures["arrivals"]) == (1, 1)
+
+
+@pytest.mark.parametrize("limits", [{"max_age_days": 1, "max_bytes": None}, {"max_age_days": None, "max_bytes": 0}])
+def test_a_job_that_cannot_be_deleted_keeps_its_project_s_others_from_nothing(house, monkeypatch, limits) -> None:
+    made = [house.job(name) for name in ("one", "two", "three")]
+    for days, job in zip((9, 8, 7), made, strict=True):
+        house.age(JobRow, job, days=days)
+    with house.catalog.transaction() as tx:
+        retention.put(tx, **limits)
+    delete_job = expiry._delete_job
+
+    def refuse(tx, id: str) -> None:
+        if id == made[0]:
+            raise ZeroDivisionError
+        delete_job(tx, id)
+
+    monkeypatch.setattr(expiry, "_delete_job", refuse)
+    sweeper = Sweeper(house.catalog, house.store, Settings())
+    sweeper.run_once()
+    assert sweeper.chore.failures["expired_jobs"] == 1
+    assert {key for key in house.groups() if key.startswith("jobs/")} == {f"jobs/{made[0]}"}
 
 
 def test_what_failed_is_told_and_what_did_not_is_a_zero(house, monkeypatch) -> None:

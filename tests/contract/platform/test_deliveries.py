@@ -5,6 +5,7 @@ import threading
 from datetime import datetime, timedelta
 
 import pytest
+from sqlalchemy import text
 
 from l3ps_platform import workflow
 from l3ps_platform.catalog import Catalog, DeliveryRow, DeliveryState, ProjectRow, WebhookRow, events, webhooks
@@ -277,6 +278,28 @@ def test_what_is_put_back_is_due_at_once_and_no_attempt(post) -> None:
         deliveries.put_back(tx, parcels)
     (again,) = post.take(owner="two")
     assert again.attempts == 0
+
+
+def test_whoever_puts_back_waits_for_who_holds_the_webhook(post) -> None:
+    hook = post.hook()
+    post.ping(hook, 2)
+    parcels = post.take(owner="one")
+
+    def put_back() -> None:
+        with post.catalog.transaction() as tx:
+            deliveries.put_back(tx, parcels)
+
+    thread = threading.Thread(target=put_back)
+    with post.catalog.transaction() as tx:
+        webhooks.lock(tx.session, hook)
+        thread.start()
+        while thread.is_alive() and post.catalog.engine.dialect.name == "postgresql":
+            with post.catalog.reading() as session:
+                if session.scalar(text("SELECT count(*) FROM pg_locks WHERE NOT granted")):
+                    break
+        assert thread.is_alive()
+    thread.join()
+    assert len(post.take(owner="two")) == 2
 
 
 def test_failures_are_logged_and_the_last_one_is_final(post) -> None:

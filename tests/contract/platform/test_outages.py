@@ -1,12 +1,17 @@
 """Outages use up no attempt, crashes do, on SQLite and PostgreSQL."""
 
 import threading
-from datetime import timedelta
+from datetime import datetime, timedelta
+from types import SimpleNamespace
+
+from sqlalchemy.orm import Session
 
 from l3ps.errors import Problem
 from l3ps_platform import workflow
-from l3ps_platform.catalog import JobState, StageState, stages
-from l3ps_platform.workflow import Cause, Reconciler, Retry, failure
+from l3ps_platform.catalog import Catalog, JobState, StageState, stages
+from l3ps_platform.catalog import session as session_module
+from l3ps_platform.errors import CatalogUnavailable
+from l3ps_platform.workflow import Cause, Reconciler, Retry, failure, reconcile
 from l3ps_platform.workflow.retries import next_try
 
 AWAY = failure("the store is away", Cause.STORE_UNAVAILABLE)
@@ -110,6 +115,44 @@ def test_leases_that_ran_out_unseen_are_borne_for_a_while(play, sent, tidy) -> N
     stop.set()
     broom.join()
     assert play.stage(held.stage_id).state is StageState.RUNNING
+    assert tidy().expired == 1
+
+
+def lost_after(reconciler: Reconciler, play) -> int:
+    """How many lost workers a round of the reconciler notices."""
+    play.submit(scenes=1)
+    play.take(lease=-1)
+    return reconciler.run_once().expired
+
+
+def test_leases_are_borne_where_the_catalog_is_away_and_not_for_a_deadlock(play, sent, tidy, monkeypatch) -> None:
+    def deadlock(*_: object) -> None:
+        raise CatalogUnavailable("deadlock detected")
+
+    monkeypatch.setattr(reconcile, "settle_arrivals", deadlock)
+    reconciler = Reconciler(play.catalog, tidy.queue, tidy.settings)
+    reconciler.run_once()
+    assert (lost_after(reconciler, play), reconciler.chore.failures["arrivals"]) == (1, 2)
+    monkeypatch.setattr(Catalog, "ping", deadlock)
+    reconciler.run_once()
+    assert lost_after(reconciler, play) == 0
+
+
+def test_leases_are_borne_after_a_catalog_that_was_silent(play, sent, tidy, monkeypatch) -> None:
+    """It answers in the end, and its clock has gone on: leases ran out that nobody could prolong."""
+    clock, now = [0.0], Catalog.now
+    monkeypatch.setattr(session_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    reconciler = Reconciler(play.catalog, tidy.queue, tidy.settings)
+    assert lost_after(reconciler, play) == 1
+
+    def silent(catalog: Catalog, session: Session) -> datetime:
+        clock[0] += tidy.settings.lease_seconds / 2
+        return now(catalog, session)
+
+    monkeypatch.setattr(Catalog, "now", silent)
+    assert lost_after(reconciler, play) == 0, "of the very answer that was late"
+    monkeypatch.setattr(Catalog, "now", now)
+    assert reconciler.run_once().expired == 0
     assert tidy().expired == 1
 
 

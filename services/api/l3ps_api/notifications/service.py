@@ -14,6 +14,7 @@ from l3ps_api.services import Services
 from l3ps_platform.catalog import RuleRow, rules
 from l3ps_platform.objects import Reference, find_source
 from l3ps_platform.workflow import settle_arrivals
+from l3ps_platform.workflow.chores import Chore
 
 log = structlog.get_logger(__name__)
 
@@ -42,7 +43,8 @@ def take(services: Services, project_id: str, notification: Notification) -> Not
     with services.catalog.transaction() as tx:
         new = rules.note(tx, list(found.values()))
     if new:
-        settle_arrivals(services.catalog, _SECONDS, services.settings.max_active_jobs)
+        chore = Chore("notification", "arrivals")  # counted by the reconciler, which takes up what fails here
+        settle_arrivals(services.catalog, _SECONDS, services.settings.max_active_jobs, chore)
     ignored = len(notification.records) - met
     log.info("notification", accepted=len(new), known=len(found) - len(new), ignored=ignored)
     return Noted(accepted=len(new), known=len(found) - len(new), ignored=ignored)
