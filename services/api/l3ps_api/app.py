@@ -32,7 +32,6 @@ from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
-from l3ps_api.patience import HangUp
 from l3ps_api.places import Places, Turns
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.replies import asked_within
@@ -139,7 +138,6 @@ def create_app(settings: Settings) -> FastAPI:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     app.add_middleware(AccessLog)
-    app.add_middleware(HangUp)
     describe(app)
     return app
 
