@@ -27,12 +27,11 @@ from l3ps_api.keyring import Keyring
 from l3ps_api.keys import service as key_service
 from l3ps_api.keys.routes import router as keys
 from l3ps_api.labels.routes import router as labels
-from l3ps_api.middleware import LoopbackHosts, RequestMetrics, SizeLimits
+from l3ps_api.middleware import JSON_BODY_BYTES, LoopbackHosts, RequestMetrics, SizeLimits
 from l3ps_api.models.routes import router as models
 from l3ps_api.notifications.routes import router as notifications
 from l3ps_api.objects.routes import router as objects
 from l3ps_api.operations import operations_of
-from l3ps_api.patience import HangUp
 from l3ps_api.places import Places, Turns
 from l3ps_api.projects.routes import router as projects
 from l3ps_api.replies import asked_within
@@ -65,6 +64,8 @@ TURNS = 32
 half a minute, and 16 are not all."""
 WAITING = 1000
 """Requests of a project that wait for a turn: the burst that a key may send is 2000."""
+WAITING_BYTES = 16 << 20
+"""Of their bodies: each is read before it waits, and as objects takes several times its bytes."""
 ARCHIVES = 8
 """Archives sent at once: each holds a connection to the store and a manifest (45 MB for 68,000 files), and one of many
 small files keeps a thread busy. On two busy cores, in one run each, a neighbour's request took 12 s with twice as many
@@ -113,7 +114,7 @@ def create_app(settings: Settings) -> FastAPI:
     streams.set_function(lambda: app.state.events.places.taken)
     app.state.metrics = Shared(lambda: generate_latest(app.state.registry))
     app.state.readiness = Shared(lambda: check_all(services))
-    app.state.turns = Turns(TURNS, WAITING)
+    app.state.turns = Turns(TURNS, WAITING, WAITING_BYTES)
     guarded = [Depends(authenticate), Depends(_turn, scope="function")]
     app.include_router(system)
     app.include_router(objects)  # its URLs are signed, each for one act
@@ -139,7 +140,6 @@ def create_app(settings: Settings) -> FastAPI:
         log.warning("L3PS_TOKEN is not set: nobody is the operator, only API keys get in", host=settings.host)
     app.add_middleware(RequestMetrics, registry=app.state.registry)
     app.add_middleware(AccessLog)
-    app.add_middleware(HangUp)
     describe(app)
     return app
 
@@ -149,7 +149,10 @@ async def _turn(request: Request, principal: PrincipalDep) -> AsyncIterator[None
         yield
         return
     turns: Turns = request.app.state.turns
-    async with turns.turn(principal.project_id):
+    declared = request.headers.get("content-length", "")
+    chunked = "transfer-encoding" in request.headers
+    size = int(declared) if declared.isdigit() else JSON_BODY_BYTES if chunked else 0
+    async with turns.turn(principal.project_id, size):
         yield  # until there is an answer; sending it takes as long as the client does
 
 

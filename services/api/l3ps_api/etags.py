@@ -19,7 +19,7 @@ from l3ps_platform.catalog.conditions import only_if
 _CHANGING = ("PUT", "PATCH", "DELETE")
 _AT_ONCE = 8
 """Changes with a condition: each takes a thread and a connection, and asks with others of them."""
-_WAITING = 100
+_WAITING, _WAITING_BYTES = 100, 16 << 20
 """Such changes of a project that wait, each with its body."""
 
 
@@ -39,7 +39,7 @@ class ETags:
 
     def __init__(self, app: ASGIApp, operations: Callable[[], Operations]) -> None:
         self.app, self._operations = app, operations
-        self._few = Turns(_AT_ONCE, _WAITING)
+        self._few = Turns(_AT_ONCE, _WAITING, _WAITING_BYTES)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not guarded(scope["path"]):
@@ -72,7 +72,7 @@ class ETags:
         body = await read_body(receive)  # first: nobody waits for a client that takes its time
         if body is None:
             return
-        async with self._few.turn(scope["state"]["principal"].project_id):
+        async with self._few.turn(scope["state"]["principal"].project_id, len(body)):
             reply = await self._check(scope, wanted)
             if reply is None:
                 with only_if(lambda: self._check_again(scope, wanted)):

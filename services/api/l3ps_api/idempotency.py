@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import structlog
-from fastapi.concurrency import run_in_threadpool
+from anyio import CapacityLimiter, to_thread
 from pydantic import BaseModel
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -36,6 +36,8 @@ _TRANSIENT = (b"content-length", b"date", b"server", b"connection", b"transfer-e
 _KEY = re.compile(r"[\x20-\x7e]{1,255}")
 _QUOTED_SECRET = re.compile(rb'"' + SECRET.pattern + rb'"')
 _PURGE_SECONDS = 60.0
+_AT_ONCE = 4
+"""Looks at keys, in threads of their own: they take no turn, and are not to have the threads of those who do."""
 _NOT_KEPT = (401, 403, 429)
 _SHOWN_ONCE = {"api_keys"}
 """Tables whose secret a repetition does not show again: the catalog does not have it."""
@@ -55,6 +57,7 @@ class Idempotency:
     def __init__(self, app: ASGIApp, services: Services, operations: Callable[[], Operations], remade: Remade) -> None:
         self.app, self._services, self._operations, self._remade = app, services, operations, remade
         self._purged_at = time.monotonic()
+        self._threads = CapacityLimiter(_AT_ONCE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         principal: Principal | None = scope.get("state", {}).get("principal") if scope["type"] == "http" else None
@@ -69,7 +72,7 @@ class Idempotency:
         services = replace(self._services, catalog=self._services.catalog.scoped(principal.project_id))
         try:
             asked = fingerprint(principal, scope, body)
-            state = await run_in_threadpool(self._begin, services, key, asked)
+            state = await to_thread.run_sync(self._begin, services, key, asked, limiter=self._threads)
         except requests.OtherRequest:
             what = "it was used for another request, or by another caller"
             raise _refused(422, "idempotency-key-reused", what, "Use a new key.") from None
@@ -130,7 +133,7 @@ class Idempotency:
             only = tables.get(scope["path"].removeprefix("/v1/"))
             with requests.bound(replace(held, kinds=frozenset(tables.values()), only=only)):
                 reply = await hold(self.app, scope, again(body, receive), send) or Reply()
-        await run_in_threadpool(self._record, services, held, reply)
+        await to_thread.run_sync(self._record, services, held, reply, limiter=self._threads)
         return reply
 
     def _record(self, services: Services, held: requests.Held, reply: Reply) -> None:
@@ -156,7 +159,7 @@ class Idempotency:
         """The answer for a resource that an earlier request made."""
         kind, id = made
         if kind in self._remade:
-            document = await run_in_threadpool(self._remade[kind], services, id)
+            document = await to_thread.run_sync(self._remade[kind], services, id, limiter=self._threads)
             return Reply(200, [(b"content-type", b"application/json")], document.model_dump_json().encode())
         return await ask(self.app, scope, _place(made))
 

@@ -95,33 +95,42 @@ class Turns:
     Args:
         limit: how many there are.
         waiting: requests of a project that may wait.
+        waiting_bytes: those of their bodies together.
     """
 
-    def __init__(self, limit: int, waiting: int) -> None:
-        self._shares, self._most = Shares(limit), waiting
+    def __init__(self, limit: int, waiting: int, waiting_bytes: int) -> None:
+        self._shares, self._most, self._most_bytes = Shares(limit), waiting, waiting_bytes
+        self._bytes: Counter[str] = Counter()
         self._lines: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
 
     @asynccontextmanager
-    async def turn(self, project_id: str) -> AsyncIterator[None]:
+    async def turn(self, project_id: str, size: int = 0) -> AsyncIterator[None]:
         """Wait for a turn, and have it until the block ends.
+
+        Args:
+            project_id: whose.
+            size: of the request's body, bytes.
 
         Raises:
             ApiProblem: 429, too many wait already.
         """
         if project_id in self._lines or not self._shares.take(project_id):
-            await self._wait(project_id)
+            await self._wait(project_id, size)
         try:
             yield
         finally:
             self._shares.give_back(project_id)
             self._call()
 
-    async def _wait(self, project_id: str) -> None:
-        line = self._lines.setdefault(project_id, deque())
-        if len(line) >= self._most:
+    async def _wait(self, project_id: str, size: int) -> None:
+        line = self._lines.get(project_id, deque())
+        # The first may wait, however large: it is not refused what nobody else has.
+        if len(line) >= self._most or (line and self._bytes[project_id] + size > self._most_bytes):
             raise too_many(1, f"{len(line)} requests of this project wait already")
         mine = asyncio.get_running_loop().create_future()
+        self._lines[project_id] = line
         line.append(mine)
+        self._bytes[project_id] += size
         try:
             await mine
         except asyncio.CancelledError:
@@ -129,6 +138,10 @@ class Turns:
                 self._shares.give_back(project_id)
             self._call()
             raise
+        finally:
+            self._bytes[project_id] -= size
+            if not self._bytes[project_id]:
+                del self._bytes[project_id]
 
     def _call(self) -> None:
         """Have those who may go on: the projects' first, in turn."""

@@ -9,10 +9,10 @@ from contextlib import aclosing
 import structlog
 from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
+from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from l3ps.errors import L3psError
-from l3ps_api.patience import PatientResponse
 from l3ps_api.problems import ApiProblem, ErrorItem, answer
 
 log = structlog.get_logger(__name__)
@@ -23,7 +23,7 @@ Read = Callable[[int, int], Iterator[bytes]]
 """Yields the bytes from a first up to, and without, a last position; what lies before is not read."""
 
 
-class RangedResponse(PatientResponse):
+class RangedResponse(StreamingResponse):
     """A body of known length, whole or the one range that was asked for.
 
     Blocks come from a thread, one at a time and only as fast as the client takes them, so memory stays flat whatever

@@ -159,7 +159,8 @@ def purge(tx: Transaction, most: int = 5000) -> int:
     """Forget keys whose time is over, ``most`` at once: somebody's request waits for it. Returns how many."""
     row = RequestRow
     old = select(row.project_id, row.key).where(row.expires_at <= tx.now).limit(most)
-    gone = delete(row).where(tuple_(row.project_id, row.key).in_(old))
+    # Asked once more: a key may have been taken anew since it was found.
+    gone = delete(row).where(tuple_(row.project_id, row.key).in_(old), row.expires_at <= tx.now)
     return _count(tx.session.execute(gone, execution_options={"synchronize_session": False}))
 
 

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 
 import httpx
 import pytest
+from tests.conftest import wait_until
 
 from l3ps_api.keyring import new_secret
 from l3ps_platform.ids import new_id
@@ -118,8 +119,7 @@ def test_of_the_streams_each_project_gets_a_share_however_many_are_opened_at_onc
         refused(refusal, "too-many-streams")
         assert open_stream(modest).status_code == 200
         opened[0].close()
-        while "l3ps_event_streams 2.0" not in httpx.get(f"{strict}/metrics").text:
-            pass  # until the service has seen it
+        wait_until(lambda: "l3ps_event_streams 2.0" in httpx.get(f"{strict}/metrics").text)
         assert open_stream(greedy).status_code == 200
 
 

@@ -47,7 +47,7 @@ class Play:
 
 
 def played(scenario) -> None:
-    asyncio.run(scenario(Play(Turns(limit=4, waiting=5))))
+    asyncio.run(scenario(Play(Turns(limit=4, waiting=5, waiting_bytes=100))))
 
 
 def test_one_project_waits_for_itself_and_others_are_served_at_once() -> None:
@@ -90,5 +90,26 @@ def test_a_line_has_an_end() -> None:
         assert caught.value.status == 429 and caught.value.headers["Retry-After"] == "1"
         async with play.turns.turn("b"):
             pass
+
+    played(scenario)
+
+
+def test_large_bodies_make_a_short_line() -> None:
+    async def scenario(play: Play) -> None:
+        await play.ask("a1", "a2")
+        async with asyncio.TaskGroup() as tasks:
+
+            async def wait() -> None:
+                async with play.turns.turn("a", 60):
+                    pass
+
+            tasks.create_task(wait())
+            await play.settle()
+            with pytest.raises(ApiProblem) as caught:
+                async with asyncio.timeout(5), play.turns.turn("a", 60):
+                    raise AssertionError
+            assert caught.value.status == 429
+            await play.end("a1", "a2")
+        await asyncio.wait_for(wait(), 5)
 
     played(scenario)

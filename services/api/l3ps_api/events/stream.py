@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import structlog
 from anyio import to_thread
+from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
 from l3ps_api.events.hub import PAGE, Entry, EventHub
-from l3ps_api.patience import PatientResponse
 from l3ps_platform.catalog.kinds import JOB_OVER
 from l3ps_platform.errors import PlatformError
 
@@ -47,8 +47,8 @@ class Feed:
     over: bool = False
 
 
-class EventStream(PatientResponse):
-    """The answer: never kept by anyone on the way, and ended when the client does not take it.
+class EventStream(StreamingResponse):
+    """The answer: never kept by anyone on the way.
 
     Not FastAPI's class of this purpose, which wants routes that yield: ours says before the stream begins whether there
     is one.
