@@ -61,7 +61,7 @@ class Gate:
         self.app, self._keyring, self._operations = app, keyring, operations
         self._rates = Buckets(settings.rate_per_second, settings.rate_burst)
         self._failures = Buckets(settings.failures_per_second, settings.failures_burst)
-        self._verifying = CapacityLimiter(_VERIFYING)
+        self._verifying, self._suspected = CapacityLimiter(_VERIFYING), CapacityLimiter(1)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not guarded(scope["path"]):
@@ -91,8 +91,10 @@ class Gate:
         found = None if fresh else self._keyring.recall(secret, project)
         if found is not None:
             return found
+        # Who shares an address with a flood of wrong ones waits with them, and nobody else does.
+        line = self._suspected if self._failures.wait(_address(scope)) else self._verifying
         try:
-            found = await to_thread.run_sync(self._keyring.verify, secret, project, limiter=self._verifying)
+            found = await to_thread.run_sync(self._keyring.verify, secret, project, limiter=line)
         except NotFound as error:
             remedy = "GET /v1/projects lists those there are."
             raise invalid(PROJECT_HEADER, f"there is no project {error.id!r}", remedy) from error

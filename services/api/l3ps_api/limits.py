@@ -39,6 +39,11 @@ class Buckets:
             del self._full_at[next(iter(self._full_at))]
         return max(0.0, wait)
 
+    def wait(self, caller: str) -> float:
+        """The seconds until the caller may ask, 0 if now; counts nothing."""
+        now = self._clock()
+        return max(0.0, self._full_at.get(caller, now) - self._slack - now)
+
 
 def too_many(seconds: float, what: str) -> ApiProblem:
     """429 for a caller that must wait."""
