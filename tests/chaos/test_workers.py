@@ -35,7 +35,8 @@ def test_worker_killed(scenario, ends_well) -> None:
 def test_out_of_memory(scenario, ends_well) -> None:
     """A real MemoryError in an ingest, a segment, two refine stages and a publish stage."""
     faults = [{"stage": name, "fault": "memory", "nth": [2]} for name in ("ingest", "segment", "publish")]
-    service = scenario(faults=[*faults, {"stage": "refine", "fault": "memory", "nth": [3, 4]}])
+    more = {"stage": "refine", "fault": "memory", "nth": [3, 4]}
+    service = scenario(faults=[*faults, more], lease_seconds=10.0)  # what is told of comes before the lease runs out
     service.begin()
     worker = service.start_worker(concurrency=2)
     service.at_work()
@@ -48,7 +49,7 @@ def test_out_of_memory(scenario, ends_well) -> None:
 def test_native_abort(scenario, ends_well) -> None:
     """SIGABRT from compiled code in a segment, a refine and a publish stage."""
     faults = [{"stage": name, "fault": "abort", "nth": [2]} for name in ("segment", "refine", "publish")]
-    service = scenario(faults=faults)
+    service = scenario(faults=faults, lease_seconds=10.0)
     service.begin()
     service.start_worker(concurrency=2)
     service.at_work()
