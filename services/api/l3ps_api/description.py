@@ -14,6 +14,7 @@ _ERRORS = {
     "401": "The credentials are missing or not valid.",
     "403": "The credentials, or the signature of the URL, do not permit this.",
     "404": "There is no such resource, or not in this project.",
+    "408": "The body did not come in time.",
     "409": "Not possible in the present state of things; or a request with this Idempotency-Key is in progress.",
     "412": "The document has another ETag than `If-Match` names.",
     "413": "The body, or the file announced, is too large.",
@@ -79,10 +80,10 @@ def _complete(path: str, method: str, operation: dict[str, Any]) -> None:
             headers += ["IfNoneMatch"] if document else []
         elif method == "post":
             headers += ["IdempotencyKey"]
-            errors |= {"404", "409", "413"}
+            errors |= {"404", "408", "409", "413"}
         else:
             headers += ["IfMatch"]
-            errors |= {"404", "409", "412", "413"}
+            errors |= {"404", "408", "409", "412", "413"}
         if "{" in path or not document:
             errors |= {"404", "409"}
         if "206" in responses:

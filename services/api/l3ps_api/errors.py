@@ -136,6 +136,9 @@ def _http_error(request: Request, error: HTTPException) -> ApiProblem:
     if status == HTTPStatus.REQUEST_ENTITY_TOO_LARGE:
         what, _, remedy = str(error.detail).partition(". ")
         return too_large("body", what, remedy)
+    if status == HTTPStatus.REQUEST_TIMEOUT:
+        what, _, remedy = str(error.detail).partition(". ")
+        return fault(status, code, status.phrase, "body", what, remedy, headers)
     return ApiProblem(status, code, status.phrase, str(error.detail), headers=headers)
 
 

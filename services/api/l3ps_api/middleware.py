@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -12,6 +13,9 @@ from l3ps_api.problems import answer, fault, too_large
 
 JSON_BODY_BYTES = 2 << 20
 """The largest JSON body taken: the completion of an upload of 10,000 parts is below 1 MB."""
+
+BODY_SECONDS = 60.0
+"""A client has so long to send a JSON body."""
 
 HEADER_BYTES = 16 << 10
 """All headers of a request."""
@@ -76,6 +80,8 @@ class LoopbackHosts:
 class SizeLimits:
     """Refuses headers and JSON bodies that are too large, the latter before they are read where they tell their length.
 
+    Nor does it wait for ever for a body whose client sends no more of it.
+
     ``exempt`` is the begin of paths whose bodies may be of any size.
     """
 
@@ -103,12 +109,18 @@ class SizeLimits:
         if declared.isdigit() and int(declared) > JSON_BODY_BYTES:
             await answer(too_large("body", what, remedy), scope["path"])(scope, receive, send)
             return
-        received = 0
+        received, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_SECONDS
 
         async def limited() -> Message:
-            nonlocal received
-            message = await receive()
+            nonlocal received, whole
+            try:
+                async with asyncio.timeout_at(None if whole else deadline):
+                    message = await receive()
+            except TimeoutError:
+                slow = f"the body did not come within {BODY_SECONDS:.0f} s. Send it at once"
+                raise HTTPException(408, slow, {"Connection": "close"}) from None
             received += len(message.get("body", b""))
+            whole = not message.get("more_body", False)
             if received > JSON_BODY_BYTES:
                 raise HTTPException(413, f"{what}. {remedy}")  # FastAPI lets no other exception through here
             return message
