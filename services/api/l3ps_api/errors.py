@@ -102,6 +102,9 @@ def _field_error(fault: dict[str, Any]) -> ErrorItem:
     kind = fault["type"]
     if kind == "json_invalid":
         return ErrorItem(where="body", what="the body is not valid JSON", remedy="Send a JSON object.")
+    if place == "body" and not names and kind != "missing":
+        remedy = "Send one, with `Content-Type: application/json`."
+        return ErrorItem(where="body", what="the body is not a JSON object", remedy=remedy)
     name = ".".join(names)
     where = name if place == "body" and name else f"{place} {name}".rstrip()
     what = str(fault["msg"]).removeprefix("Value error, ")

@@ -60,6 +60,13 @@ def test_a_json_body_that_is_too_large_is_refused_unread_whether_or_not_it_says_
     assert answer.headers["content-type"] == "application/problem+json"
 
 
+@pytest.mark.parametrize("content", [b"hello", b'"hello"', b"[]"])
+def test_what_is_no_json_object_is_told_so_in_plain_words(service, content):
+    document = service.refused(service.http.post("/v1/jobs", content=content), 422, "invalid-request")
+    assert "Send" in document["detail"] and "JSON object" in document["detail"]
+    assert document["errors"][0]["where"] == "body"
+
+
 def test_a_loopback_service_answers_only_to_loopback_names(service):
     answer = service.http.get("/healthz", headers={"host": "evil.example"})
     assert "evil.example" in service.refused(answer, 421, "foreign-host")["detail"]

@@ -163,11 +163,19 @@ def test_urls_are_given_for_parts_that_there_are(service, numbers):
 
 
 def test_a_file_s_name_is_nowhere_in_the_store(service):
-    upload = service.announce(10, "../../etc/passwd #1?.tar")
+    upload = service.announce(10, "..%2f..%2fetc passwd #1?.tar")
     with service.catalog.reading() as session:
         row = uploads.get(session, upload["id"])
-    assert (row.filename, row.object_key) == ("../../etc/passwd #1?.tar", f"uploads/{row.id}/archive")
+    assert (row.filename, row.object_key) == ("..%2f..%2fetc passwd #1?.tar", f"uploads/{row.id}/archive")
     service.http.delete(f"/v1/uploads/{upload['id']}")
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd.tar", "a\\b.zip"])
+def test_a_file_s_name_has_no_folders_in_it(service, name, nothing_kept):
+    asked = {"kind": "drive", "filename": name, "size": 10}
+    document = service.refused(service.http.post("/v1/uploads", json=asked), 422, "invalid-request")
+    assert document["errors"][0]["where"] == "filename"
+    assert "leave its folders out" in document["detail"]
 
 
 def test_a_wrong_etag_names_the_parts_and_the_upload_can_go_on(service):

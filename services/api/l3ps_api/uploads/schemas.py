@@ -5,14 +5,23 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
 from l3ps_platform.catalog import UploadState
+
+
+def _of_no_folder(name: object) -> object:
+    """Resources get their names from it, and whoever keeps files under those must not be led elsewhere."""
+    if isinstance(name, str) and ("/" in name or "\\" in name):
+        raise ValueError("a file's name has no / or \\ in it: leave its folders out")
+    return name
+
 
 Kind = Literal["drive", "model", "annotations"]
 Name = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")
 ]
+FileName = Annotated[Name, StringConstraints(pattern=r"^[^\x00-\x1f\x7f/\\]+$"), BeforeValidator(_of_no_folder)]
 Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
 
 
@@ -25,7 +34,7 @@ class UploadRequest(BaseModel):
         description="`drive`: an archive of a drive log; `model`: a zipped model bundle; `annotations`: an archive of "
         "annotated images to train from."
     )
-    filename: Name = Field(examples=["2026-11-22-morning.tar"])
+    filename: FileName = Field(examples=["2026-11-22-morning.tar"])
     size: int = Field(ge=0, description="Bytes.")
     sha256: Sha256 | None = Field(default=None, description="Of the whole file; may also come at the completion.")
 
