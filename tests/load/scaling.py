@@ -106,7 +106,7 @@ def main() -> int:
             drives / f"scaling-{given.scenes}x{given.scans}", scenes=given.scenes, scans=given.scans, seed=7
         )
         warm = [workload.drive(drives / f"warm-{n}", scenes=1, scans=1, seed=n + 50) for n in range(2)]
-        work = Workload([simulated, *warm], b"", network(folder / "m.zip"))
+        work = Workload([simulated, *warm], b"", network(folder / "m.zip"), b"")
         servers = Servers(Redis(folder / "redis"), Minio(folder / "minio"), Postgres())
         servers.postgres.start()
         servers.minio.start()
